@@ -86,6 +86,15 @@ def test_a_pair_within_the_scatter_of_its_runs_is_not_called_wrong_for_sure():
     assert not any(pair.sure for pair in rank(noisy).wrong)
 
 
+def test_few_rankings_of_equal_controllers_name_a_pair_that_is_surely_in_the_wrong_order():
+    generator = np.random.default_rng(8)
+    named = 0
+    for _ in range(60):
+        hw = np.exp(0.15 * generator.normal(size=(6, 3, 1)))
+        named += any(pair.sure for pair in rank([Contender(f"{i}", np.array([[i]]), hw[i]) for i in range(6)]).wrong)
+    assert named <= 7
+
+
 def test_a_controller_that_fails_on_the_hardware_alone_is_the_dearest_pick():
     fails = contender("wild", 0.5, 1.0)
     fails = Contender("wild", fails.sim, fails.hw[:0], 0, 4)

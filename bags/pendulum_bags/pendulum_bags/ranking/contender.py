@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,7 +11,10 @@ import numpy as np
 from pendulum_bags.arrays import Array
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["PARTS", "Contender", "compared_runs", "contenders_of", "refuse_no_number", "with_noise_of_their_own"]
+__all__ = [
+    "PARTS", "Contender", "compared_runs", "contenders_of", "error_of_difference", "refuse_no_number",
+    "with_noise_of_their_own",
+]  # fmt: skip
 
 PARTS = ("angle", "velocity", "torque")
 """Parts of the cost: q11 e^2, q22 v^2 and r u^2, each a mean over the run."""
@@ -123,3 +127,13 @@ def compared_runs(one: Contender, other: Contender) -> tuple[Array, Array, bool]
     if len(both) < 2:
         return one.hw.sum(axis=1), other.hw.sum(axis=1), False
     return np.array([ones[seed] for seed in both]), np.array([others[seed] for seed in both]), True
+
+
+def error_of_difference(own: Array, other: Array, *, paired: bool) -> tuple[float, float]:
+    """Return the standard error of the difference of two means of repeated runs, and its degrees of freedom."""
+    if paired:
+        return float(np.std(own - other, ddof=1)) / math.sqrt(own.size), own.size - 1.0
+    parts = np.array([np.var(own, ddof=1) / own.size, np.var(other, ddof=1) / other.size])
+    # Welch and Satterthwaite.
+    freedom = parts.sum() ** 2 / max(1e-300, np.sum(parts**2 / (np.array([own.size, other.size]) - 1.0)))
+    return math.sqrt(parts.sum()), float(freedom)

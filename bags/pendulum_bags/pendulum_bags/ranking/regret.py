@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pendulum_bags.distributions import Interval, student_quantile
-from pendulum_bags.ranking.contender import Contender, compared_runs
+from pendulum_bags.ranking.contender import Contender, compared_runs, error_of_difference
 
 __all__ = ["regret_share"]
 
@@ -107,17 +107,12 @@ def _limits(
     repeated = [one for one in (own, other) if one.size > 1]
     if not repeated:
         return math.nan, math.nan
-    if paired:
-        deviation, freedom = float(np.std(own - other, ddof=1)) / math.sqrt(own.size), own.size - 1.0
-    elif len(repeated) == 1:
+    if len(repeated) == 1:
         # The one that ran once is taken to scatter like the other.
         deviation = float(np.std(repeated[0], ddof=1)) * math.sqrt(1.0 + 1.0 / repeated[0].size)
         freedom = repeated[0].size - 1.0
     else:
-        parts = np.array([np.var(own, ddof=1) / own.size, np.var(other, ddof=1) / other.size])
-        deviation = float(np.sqrt(parts.sum()))
-        # Welch and Satterthwaite.
-        freedom = float(parts.sum() ** 2 / max(1e-300, np.sum(parts**2 / (np.array([own.size, other.size]) - 1.0))))
+        deviation, freedom = error_of_difference(own, other, paired=paired)
     tails = _TAIL / comparisons, _FAVOURED if favoured else _TAIL
     low, high = (-float(student_quantile(tail, freedom)) for tail in tails)
     return ratio - low * deviation, ratio + high * deviation
