@@ -301,6 +301,17 @@ def test_a_pick_is_made_under_other_noise_than_judges_it_or_has_a_wider_limit():
     assert 3.0 * own.high < shared.high
 
 
+def test_scores_under_shared_noise_have_a_wider_limit_too():
+    def limit(seeds):
+        values = {"a": [2.0, 2.1, 1.9], "b": [1.97, 2.12, 1.95], "far": [0.5, 0.6, 0.7]}
+        rows = {name: -np.array(scores)[:, None] for name, scores in values.items()}
+        both = [Contender(name, one, one, sim_seeds=seeds, hw_seeds=(1, 2, 3)) for name, one in rows.items()]
+        return rank(both, of_scores=True).regret_share.high
+
+    # The tail of Student's t at 0.25 % and two degrees of freedom is 3.3 times as far as at 2.5 %.
+    assert 3.0 * limit((11, 12, 13)) < limit((1, 2, 3)) < 1.0
+
+
 def test_runs_are_pairs_by_their_seeds_and_not_by_their_number():
     noise = {1: 1.0, 2: 2.0, 3: 5.0, 4: 2.0, 5: 3.0, 6: 6.0, 7: 9.0}
     a = costing("a", 1.0, [noise[seed] for seed in (1, 2, 3)], (1, 2, 3))

@@ -43,7 +43,7 @@ def regret_share(
     others = [one for i, one in enumerate(contenders) if i != pick and math.isfinite(one.cost("hw"))]
     own, least = chosen.cost("hw"), min(one.cost("hw") for one in others)
     if of_scores:
-        return _lost_share(chosen, others)
+        return _lost_share(chosen, others, favoured=favoured)
     if own <= 0.0:
         # Runs scatter by shares: of nothing there is none. One run is one run all the same.
         end = 0.0 if len(chosen.hw) > 1 else math.nan
@@ -59,7 +59,7 @@ def regret_share(
     return Interval(value, float(min(low, value)), float(max(high, value))), ""
 
 
-def _lost_share(chosen: Contender, others: Sequence[Contender]) -> tuple[Interval, str]:
+def _lost_share(chosen: Contender, others: Sequence[Contender], *, favoured: bool) -> tuple[Interval, str]:
     """Return which share of the best score a pick loses, with the limits of :func:`regret_share`."""
     own, best = -chosen.cost("hw"), max(-one.cost("hw") for one in others)
     if best <= max(own, 0.0) and own <= 0.0:
@@ -70,7 +70,7 @@ def _lost_share(chosen: Contender, others: Sequence[Contender]) -> tuple[Interva
     if own <= 0.0:
         return Interval(1.0, 1.0, 1.0), ""
     rivals = [one for one in others if one.cost("hw") < 0.0]
-    limits = np.array([_limits(one, chosen, len(rivals), of_scores=True) for one in rivals])
+    limits = np.array([_limits(one, chosen, len(rivals), of_scores=True, favoured=favoured) for one in rivals])
     if not rivals:
         return Interval(0.0, 0.0, 0.0), ""
     if np.isnan(limits).any():
