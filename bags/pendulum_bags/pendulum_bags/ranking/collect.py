@@ -105,6 +105,13 @@ def collect_contenders(
     costs: dict[str, dict[str, list[tuple[int, Array | None]]]] = {}
     for run in runs:
         costs.setdefault(run.name, {"sim": [], "hw": []})[run.side].append((run.seed, run.parts))
+    alone = [name for name in {trial.controller for trial in trials} if not all(costs[name].values())]
+    if alone:
+        ran = [f"{name} on {'hardware' if costs[name]['hw'] else 'simulation'}" for name in sorted(alone)]
+        raise DataError(
+            f"{', '.join(ran)} alone: a controller that is left out may be the one that the simulation picks; "
+            "expected runs of each on both sides, under one name, or none"
+        )
     case = Case.of(*([{IDENTITY: run.identity} for run in runs if run.side == side] for side in SIDES))
     return contenders_of(costs, {run.name for run in runs if not run.emulated}), case
 

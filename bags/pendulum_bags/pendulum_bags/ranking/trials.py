@@ -144,6 +144,8 @@ def trials_of(rows: Sequence[Mapping[str, Any]], origin: str, folder: Path, temp
         if side.casefold() not in _SIDES:
             raise DataError(f"{of}: side is {side!r}; expected simulation or hardware")
         name, value = str(given["controller"]).strip(), given[key]
+        if name in {"", "None"}:
+            raise DataError(f"{of} names no controller; expected its name")
         seed = None if given.get("seed") in (None, "") else int(_number(given["seed"], f"{of}: seed"))
         trial = Trial(name, _SIDES[side.casefold()], seed=seed, is_score=key == "score")
         if key == "file":
@@ -193,6 +195,10 @@ def table_rows(path: Path) -> list[Mapping[str, Any]]:
     rows = list(csv.DictReader(text, delimiter=delimiter))
     if not rows or "controller" not in {str(name).strip().casefold() for name in rows[0]}:
         raise DataError(f"{path} has the columns {', '.join(map(str, rows[0])) if rows else 'of nothing'}; {expected}")
+    for number, row in enumerate(rows, start=1):
+        # An empty cost is a run that failed; one that lacks its cell may have lost another.
+        if None in row.values() or any(row.get(None, ())):  # type: ignore[call-overload]
+            raise DataError(f"row {number} of {path} has not as many cells as there are columns; {expected}")
     return rows
 
 
