@@ -68,9 +68,7 @@ def frequency_response(
         Path | None,
         out_option("Folder for page, figures and measured responses; none by default."),
     ] = None,
-    plant: Annotated[
-        str, typer.Option(help="Plant of the designs: preset or file; default: that of the bag, of files thesis.")
-    ] = "",
+    plant: Annotated[str, typer.Option(help="Plant of the designs: preset or file; default: that of the bag.")] = "",
     design: Design = None,
     angle: Angle = 0.03,
     velocity: Velocity = 3.0,
@@ -99,9 +97,8 @@ def frequency_response(
     context.call_on_close(partial(show_guesses, console, readings, write_mapping))
     responses, recorded, ran = read_responses(readings)
     if not plant and any(reading.was_mapped for reading in readings):
-        if responses[0].joints:
-            raise ParameterError("recordings of several joints do not name their plant; expected --plant")
-        console.print("Designs are made on the preset thesis; --plant names another.", style="yellow")
+        named = next(reading for reading in readings if reading.was_mapped)
+        raise ParameterError(f"{named} does not name its plant; expected --plant, on which designs are made")
     several = bool(responses[0].joints)
     if several and (typed := typed_options(context, {"angle", "velocity", "torque"})):
         raise ParameterError(f"{typed[0]} is for plants of one joint; of several the LQR weights are the units")
