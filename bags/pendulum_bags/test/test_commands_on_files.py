@@ -149,11 +149,27 @@ def test_a_table_of_scores_is_ranked_by_its_numbers(tmp_path: Path, capsys: Any)
         ),
         ([{"name": "a", "side": "sim", "cost": 1}], "TABLE has the columns name, side, cost; expected a folder, or a"),
         ([{"controller": "a", "side": "sim", "file": "no.csv"}], "no.csv does not exist"),
+        ([{"controller": " ", "side": "sim", "cost": 1}], "row 1 of TABLE names no controller"),
+        (
+            [
+                {"controller": name, "side": side, "cost": 1}
+                for side in ("sim", "hw")
+                for name in ("LQR" if side == "sim" else "lqr", "b", "c", "d")
+            ],
+            "LQR on simulation, lqr on hardware alone: a controller that is left out may be the one",
+        ),
     ],
 )
 def test_a_row_that_is_no_trial_is_refused(tmp_path: Path, capsys: Any, rows: Any, words: str) -> None:
     path = table(tmp_path / "t.csv", rows)
     assert words.replace("TABLE", str(path)) in ranked(capsys, path, code=2)
+
+
+@pytest.mark.parametrize("row", ["a,sim", "a,sim,1,5"])
+def test_a_row_with_a_cell_too_few_or_too_many_is_refused(tmp_path: Path, capsys: Any, row: str) -> None:
+    path = tmp_path / "t.csv"
+    path.write_text(f"controller,side,cost\nb,hw,\n{row}\n", encoding="utf-8")
+    assert f"row 2 of {path} has not as many cells as there are columns" in ranked(capsys, path, code=2)
 
 
 def test_a_trial_that_cannot_be_ranked_is_named(tmp_path: Path, capsys: Any) -> None:
@@ -194,17 +210,19 @@ def test_a_report_of_two_files_shows_what_was_guessed(two: tuple[str, str], tmp_
 
 
 def test_two_files_have_a_frequency_response(two: tuple[str, str], tmp_path: Path, capsys: Any) -> None:
-    assert response_main([*two, "--out", str(tmp_path / "out"), "--json", "--start", "0.5"]) == 0
+    assert response_main([*two, "--json"]) == 2
+    assert "simulation.mat does not name its plant; expected --plant" in " ".join(capsys.readouterr().err.split())
+    plant = ["--plant", "thesis"]
+    assert response_main([*two, *plant, "--out", str(tmp_path / "out"), "--json", "--start", "0.5"]) == 0
     said = capsys.readouterr()
     found = json.loads(said.out)
     assert [layer["layer"] for layer in found["layers"]] == ["same_plant", "which_controllers"]
     assert found["responses"]["hw"]["largest_torque_nm"] > 1.0
-    assert "Designs are made on the preset thesis" in said.err
     assert "Guessed from names" in said.err
     # A reference that moves excites the loop, too.
-    followed = response_main([*two, "--json", "--topic", "reference=noise", "--plant", "thesis"])
+    followed = response_main([*two, *plant, "--json", "--topic", "reference=noise"])
     assert (followed, len(json.loads(capsys.readouterr().out)["layers"])) == (0, 2)
-    assert response_main([two[0], "--topic", "input=noise", "--plant", "thesis"]) == 2
+    assert response_main([two[0], *plant, "--topic", "input=noise"]) == 2
     assert "holds no disturbance during the noise; expected columns of both" in " ".join(
         capsys.readouterr().err.split()
     )

@@ -548,6 +548,17 @@ def test_a_csv_of_several_joints_is_replayed_and_the_plant_of_another_machine_is
     found = json.loads(capsys.readouterr().out)
     assert max(joint["rms"] for joint in found["joints"].values()) < 20.0 * NOISE
     assert [file.name for file in tmp_path.iterdir()] == ["run.csv"]
+    # A part gives what a file of that part alone gives.
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
+    time = np.loadtxt(path, delimiter=",", skiprows=1)[:, 0]
+    inside = (time - time[0] >= 2.0) & (time - time[0] <= 6.0)
+    kept = [line for line, wanted in zip(lines[1:], inside, strict=True) if wanted]
+    (tmp_path / "part.csv").write_text("".join([lines[0], *kept]), encoding="utf-8")
+    parts = []
+    for words in (["run.csv", "--start", "2", "--stop", "6"], ["part.csv"]):
+        assert replay_cli.main([*words, "--params", "double_pendulum", "--json"]) == 0
+        parts.append(json.loads(capsys.readouterr().out)["joints"])
+    assert parts[0] == parts[1] != found["joints"]
     other = tmp_path / "other.yaml"
     write_plant(other, plant.with_values({"inertia_2": 0.4, "inertia_1": 0.3}))
     assert replay_cli.main([str(path), "--params", str(other), "--out", str(tmp_path / "out")]) == 3

@@ -66,7 +66,7 @@ def replay(
     from pendulum_bags.runs.run_folder import write_json
 
     result: InputReplay | ControllerReplay | JointReplay
-    (reading,) = readings_of([recording], mapping, topic, dt)
+    (reading,) = readings_of([recording], mapping, topic, dt, start, stop)
     # What was guessed is shown where it ends in an error, too.
     context.call_on_close(partial(show_guesses, make_console(stderr=True), [reading], write_mapping))
     if controller:
@@ -82,8 +82,7 @@ def replay(
     elif params and Path(params).suffix != ".json" and is_mechanism(params):
         from pendulum_bags.replay.joint_replay import replay_joints
 
-        given = {"--hold": hold, "--start": start, "--stop": stop, "--prefix": prefix}
-        if unheeded := [name for name, value in given.items() if value not in (None, "")]:
+        if unheeded := [name for name, value in (("--hold", hold), ("--prefix", prefix)) if value]:
             raise DataError(f"{', '.join(unheeded)} has no effect with a plant of several joints; expected none of it")
         result = replay_joints(reading, params, window=window)
     else:

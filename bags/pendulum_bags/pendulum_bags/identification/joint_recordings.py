@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -129,7 +130,7 @@ def read_joints(
     if mapping is not None:
         reading = replace(reading, mapping=mapping, _cache={})
     if reading.has_states:
-        return _read_bag(reading.path, coordinates)
+        return _chosen_part(_read_bag(reading.path, coordinates), reading)
     motion = reading.motion
     parts: list[Recording] = []
     for index, (joint, moved) in enumerate(zip(coordinates.joints, _ordered(reading, coordinates), strict=True)):
@@ -151,7 +152,7 @@ def read_joints(
             )
         part = recording_of(motion, moved)
         parts.append(check_consistency(unwrap(part)) if joint.turns else check_consistency(part))
-    return JointRecording(
+    recording = JointRecording(
         reading.name,
         parts[0].time,
         np.stack([part.position for part in parts], axis=1),
@@ -161,6 +162,18 @@ def read_joints(
         sum(int(motion.meta.get(key, 0)) for key in ("repeated_stamps", "nan_rows")),
         _passive(coordinates, [bool(np.any(part.input)) for part in parts]),
     )
+    return _chosen_part(recording, reading)
+
+
+def _chosen_part(recording: JointRecording, reading: Reading) -> JointRecording:
+    """Return the part of a recording that its reading asks for, from its beginning [s]."""
+    if reading.start is None and reading.stop is None:
+        return recording
+    time, stop = recording.time - recording.time[0], math.inf if reading.stop is None else reading.stop
+    rows = (time >= (reading.start or 0.0)) & (time <= stop)
+    cut = {name: getattr(recording, name)[rows] for name in ("time", "position", "effort")}
+    velocity = None if recording.velocity is None else recording.velocity[rows]
+    return replace(recording, **cut, velocity=velocity)
 
 
 def _ordered(reading: Reading, coordinates: Coordinates) -> list[JointMotion]:
