@@ -197,7 +197,7 @@ def table_rows(path: Path) -> list[Mapping[str, Any]]:
         raise DataError(f"{path} has the columns {', '.join(map(str, rows[0])) if rows else 'of nothing'}; {expected}")
     for number, row in enumerate(rows, start=1):
         # An empty cost is a run that failed; one that lacks its cell may have lost another.
-        if None in row.values() or any(row.get(None, ())):  # type: ignore[call-overload]
+        if None in row.values() or any(row.get(None, ())):
             raise DataError(f"row {number} of {path} has not as many cells as there are columns; {expected}")
     return rows
 
