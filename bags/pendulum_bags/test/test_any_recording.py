@@ -632,6 +632,9 @@ def test_one_recording_in_two_formats_is_no_pair_and_no_repetition(tmp_path: Pat
         "cut, and another zero of the clock": {
             key: values[100:] - (key == "t") for key, values in step(1).items()
         },
+        "cut at both ends, and another zero of the clock": {
+            key: values[100:700] - (key == "t") for key, values in step(1).items()
+        },
     }  # fmt: skip
     for run in copies.values():
         pair = save(tmp_path / "run.npz", step(1)), save(tmp_path / "copy.npz", run)

@@ -46,6 +46,8 @@ _LEAST_LIKE = 0.5
 _LEAST_OVERLAP = 0.5
 _MOST_SAMPLES = 200_000
 _PARTS = 5
+_ROWS = 50
+"""Rows by which a part of a recording is found in it."""
 _NEAR_DEGREES = 0.3
 """Largest logarithm of the ratio of spreads to 180 / pi that is taken for degrees."""
 _NEAR_HALF_TURN = 0.3
@@ -375,13 +377,14 @@ def _refuse_copies(runs: Sequence[RunData]) -> None:
 def _is_copy(one: Series, other: Series) -> bool:
     """Return whether two recordings are one: the same rows, some of them, or points on the lines between them.
 
-    Another zero, another start of the clock and rows that were cut off at one end make no other recording; two accurate
-    simulations differ by more. A copy that was filtered or rounded, or resampled by splines, is not seen.
+    Another zero, another start of the clock and rows that were cut off make no other recording; two accurate
+    simulations differ by more. A copy that was filtered or rounded, or resampled by splines, is not seen, nor one that
+    was resampled and cut at both ends.
     """
     if one.t.size == other.t.size and _same(one.position, other.position):
         return True
     for a, b in ((one, other), (other, one)):
-        for shift in (a.t[0] - b.t[0], a.t[-1] - b.t[-1]):
+        for shift in (a.t[0] - b.t[0], a.t[-1] - b.t[-1], *_shifts_of_rows(a, b)):
             at = b.t + shift
             inside = (at >= a.t[0]) & (at <= a.t[-1])
             # A motion that comes later than that of the other, after one and the same input, is another one.
@@ -392,6 +395,18 @@ def _is_copy(one: Series, other: Series) -> bool:
             ):
                 return True
     return False
+
+
+def _shifts_of_rows(a: Series, b: Series) -> Array:
+    """Return by how much the clock of b is behind that of a, where its rows of the fastest motion are rows within a."""
+    steps, own = np.diff(a.position), np.diff(b.position)
+    first = min(int(np.argmax(np.abs(own))), max(own.size - _ROWS, 0))
+    own, error = own[first : first + _ROWS], _DIGITS * float(np.ptp(b.position))
+    at = np.flatnonzero(np.abs(steps[: max(steps.size - own.size + 1, 0)] - own[0]) <= error)
+    for row, step in enumerate(own):
+        at = at[np.abs(steps[at + row] - step) <= error]
+    shift = a.t[at[:1]] - b.t[first]
+    return np.asarray(shift[(b.t[0] + shift > a.t[0]) & (b.t[-1] + shift < a.t[-1])])
 
 
 def _same(one: Array, other: Array) -> bool:
