@@ -169,6 +169,22 @@ def test_intervals_from_a_run_held_upright_hold_the_values_of_a_machine_that_is_
     assert actuator.time_constant == pytest.approx(run.truth["time_constant"], abs=2e-4)
 
 
+def test_a_tare_that_no_common_offset_explains_is_found_as_one_of_a_recording():
+    plant, run = load_mechanism("cart_pole"), run_balanced("cart_pole", 760, 8.0)
+    half = len(run.position) // 2
+    time = 0.002 * np.arange(half)
+    halves = [
+        JointRecording(name, time, run.position[at], run.effort[at] + tare, ("zero", "zero"), velocity=run.velocity[at])
+        for name, at, tare in (("a", slice(0, half), 0.0), ("b", slice(half, 2 * half), np.array([0.5, 0.0])))
+    ]
+    result = identify_mechanism(plant, halves)
+    assert not result.refused, result.refusal
+    assert result.fit.own == ("cart.effort_offset",)
+    np.testing.assert_allclose(np.diff(result.fit.offsets, axis=0), [[-0.5]], atol=1e-4)
+    for name in ("cart_mass", "pole_inertia"):
+        assert result.intervals[name].low <= run.truth[name] <= result.intervals[name].high
+
+
 def test_a_velocity_that_contradicts_the_positions_is_not_used(tmp_path):
     plant, one = truth("cart_pole"), motion(truth("cart_pole"), 3)
     rate = np.gradient(one.position, one.time, axis=0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -58,21 +59,24 @@ def choose(
             continue
         found = fit(model, data, free, weights, states=states, tolerance=1e-4, hopeless=LARGEST_SHARE)
         if extras is not None:
-            return _with_own_offsets(found, weights), name, {}
-        model, states = (found.model, found.states) if best is None else (model, states)
+            return _with_own_offsets(start, found, weights), name, {}
+        if best is None and found.worst <= LARGEST_SHARE:
+            model, states = found.model, found.states
         errors[name] = _held_out_error(found, data, weights)
         if best is None or errors[name] < _WORTH * best[0]:
             best = (errors[name], found, name)
     if best is None:
         raise DataError(f"extras is {extras!r}; expected one of {', '.join(EXTRAS)}")
-    return _with_own_offsets(best[1], weights), best[2], errors
+    return _with_own_offsets(start, best[1], weights), best[2], errors
 
 
-def _with_own_offsets(found: MechanismFit, weights: Array) -> MechanismFit:
+def _with_own_offsets(start: MechanismModel, found: MechanismFit, weights: Array) -> MechanismFit:
     """Return the fit in which each of several recordings has offsets of its own, where the data ask for it."""
     groups = found.model.own_offsets if len(found.data) > 1 else ()
     if not groups:
         return found
+    # Where one offset for all explains little, its values are far off.
+    begin: dict[str, Any] = {} if found.worst <= LARGEST_SHARE else {"model": start, "states": None}
     trials = [
         found.again(
             weights,
@@ -81,6 +85,7 @@ def _with_own_offsets(found: MechanismFit, weights: Array) -> MechanismFit:
             free=tuple(name for name in found.free if name not in own),
             tolerance=1e-4,
             hopeless=LARGEST_SHARE,
+            **begin,
         )
         for own in groups
     ]

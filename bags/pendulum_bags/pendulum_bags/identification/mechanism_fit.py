@@ -493,7 +493,9 @@ def _step(
         # Of the own offsets with those of the parameters of this recording, its start states eliminated.
         own = (matrix[:, :both, :both] - across[:, :, :both]).sum(axis=0)
         down = slope[:, :both].sum(axis=0) - across[:, :, both].sum(axis=0)
-        found = _eliminated(own[None], down[None], k, damping)[0]
+        # An offset that only moves the starts leaves rounding here, which is no information.
+        seen = np.einsum("wii->i", matrix[:, k:both, k:both])
+        found = _eliminated(own[None], down[None], k, damping, 1e-10 * seen)[0]
         offsets.append(found)
         reduced = reduced + own[:k, :k] - own[:k, k:] @ found[:, :k]
         gradient = gradient + down[:k] - own[:k, k:] @ found[:, k]
@@ -516,12 +518,16 @@ def _step(
     )
 
 
-def _eliminated(matrix: Array, gradient: Array, k: int, damping: float) -> Array:
-    """Return how what comes after the first k unknowns follows them, and their own step, shape (w, x, k + 1)."""
+def _eliminated(matrix: Array, gradient: Array, k: int, damping: float, least: Array | float = 0.0) -> Array:
+    """Return how what comes after the first k unknowns follows them, and their own step, shape (w, x, k + 1).
+
+    ``least`` is added to their information; what has none stays where it is.
+    """
     inner = matrix[:, k:, k:].copy()
     # What a wrong model's motion hardly shows must not stop the search.
     diagonal = np.einsum("wii->wi", inner)
-    diagonal[:] = (1.0 + damping) * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True, initial=0.0)
+    diagonal[:] = (1.0 + damping) * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True, initial=0.0) + least
+    diagonal[diagonal == 0.0] = 1.0
     right = np.concatenate((matrix[:, k:, :k], gradient[:, k:, None]), axis=2)
     return np.linalg.solve(inner, right)
 
