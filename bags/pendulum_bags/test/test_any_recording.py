@@ -18,6 +18,7 @@ import yaml
 from pendulum_bags.commands.analyse_cli import main as analyse_main
 from pendulum_bags.commands.compare_cli import main as compare_main
 from pendulum_bags.commands.identify_cli import main as identify_main
+from pendulum_bags.commands.recording_options import readings_of
 from pendulum_bags.commands.replay_cli import main as replay_main
 from pendulum_bags.recordings.reading import Reading, write_mapping
 from pendulum_bags.runs.read_recording import read_recording
@@ -429,6 +430,13 @@ def test_options_name_what_a_file_does_not(tmp_path: Path) -> None:
     foreign_bag(tmp_path / "bag")
     chosen = Reading(tmp_path / "bag", topics=("joint_states=/robot/state", "effort=/cmd/data.0"))
     np.testing.assert_allclose(chosen.motion.joints[0].position, RUN["position"])
+    # A name that another recording has is shown where this one lacks it, and does not keep its own from being found.
+    named = save(tmp_path / "named.npz", RUN)
+    other = Reading(named, topics=("position=a",))
+    assert other.rules.joints[""]["position"] == Reading(named).rules.joints[""]["position"]
+    assert ("position", "", True) in [(one.quantity, one.column, one.assumed) for one in other.guesses]
+    with pytest.raises(DataError, match=r"named.npz has no 'a', which --topic names for position; expected one of t"):
+        readings_of([named], topics=["position=a"])[0].rules  # noqa: B018
     with pytest.raises(DataError, match=r"--topic is 'angle=a'; expected ROLE=NAME"):
         Reading(tmp_path / "run.npz", topics=("angle=a",)).rules  # noqa: B018
 

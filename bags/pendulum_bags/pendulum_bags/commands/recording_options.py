@@ -66,8 +66,10 @@ def readings_of(
     if start is not None and stop is not None and not stop > start:
         raise DataError(f"--stop is {stop:g} s; expected more than --start, {start:g} s")
     each: list[str | None] = [*given] * len(paths) if len(given) == 1 else [*given] or [None] * len(paths)
+    alone = len(paths) == 1 and paths[0] != Path()  # which is the template of several
     return [
-        Reading(path, mapping, tuple(topics or ()), dt, start, stop) for path, mapping in zip(paths, each, strict=True)
+        Reading(path, mapping, tuple(topics or ()), dt, start, stop, alone)
+        for path, mapping in zip(paths, each, strict=True)
     ]
 
 

@@ -31,7 +31,7 @@ from pendulum_bags.recordings.physics import (
 from pendulum_bags.recordings.units import INPUTS, UNITS, known_unit, quantity_of
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["Guess", "guess_rules"]
+__all__ = ["Guess", "guess_rules", "is_of"]
 
 _WORDS: Mapping[str, frozenset[str]] = {
     "time": frozenset({"t", "time", "times", "timestamp", "timestamps", "stamp", "tout", "elapsed", "zeit", "sec"}),
@@ -137,6 +137,11 @@ class _Found:
         return f"{quantity} of {self.name}" if self.name else quantity
 
 
+def is_of(column: str, place: str) -> bool:
+    """Return whether a column is one of a given name, or of a topic or path of that name."""
+    return column == place or column.startswith((f"{place}/", f"{place}.", f"{place}["))
+
+
 def guess_rules(
     columns: Columns, *, period: float | None = None, only: Mapping[str, str] | None = None
 ) -> tuple[Rules, list[Guess]]:
@@ -209,7 +214,7 @@ class _Guesser:
 
     def _candidate(self, name: str) -> _Candidate | None:
         for role, start in self.only.items():
-            if name == start or name.startswith((f"{start}/", f"{start}.", f"{start}[")):
+            if is_of(name, start):
                 wanted = role
                 break
         else:

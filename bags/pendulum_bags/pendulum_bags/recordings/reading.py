@@ -18,7 +18,7 @@ from pendulum_bags.recordings.bag_columns import read_bag_columns
 from pendulum_bags.recordings.bridge_programs import last_words, run_bridge_program
 from pendulum_bags.recordings.columns import Column, Columns, part_of
 from pendulum_bags.recordings.delimited import read_delimited
-from pendulum_bags.recordings.guess import Guess, guess_rules
+from pendulum_bags.recordings.guess import Guess, guess_rules, is_of
 from pendulum_bags.recordings.mapping import MAPPINGS, Motion, Rules, apply_rules, load_rules
 from pendulum_bags.recordings.tables import is_lerobot, read_lerobot, read_parquet
 from pendulum_msgs_py.contract.names import JOINT_STATES
@@ -62,6 +62,7 @@ class Reading:
         topics: ``ROLE=TOPIC`` or ``ROLE=COLUMN``: where a role is taken from, such as ``joint_states=/robot/state``.
         dt: Time between two rows of a file without a time column [s].
         start, stop: Part to take, from the beginning of the recording [s].
+        alone: Whether ``topics`` are of no other recording: each is to be in this one.
     """
 
     path: Path
@@ -70,6 +71,7 @@ class Reading:
     dt: float | None = None
     start: float | None = None
     stop: float | None = None
+    alone: bool = False
     _cache: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def __fspath__(self) -> str:
@@ -141,8 +143,22 @@ class Reading:
                 rules = load_rules(known, self.path)
                 self._cache["rules"] = (rules, _taken_by_name(self.columns, known, rules) if self.is_guessed else ())
             else:
-                self._cache["rules"] = guess_rules(self.columns, period=self.dt, only=_roles(self.topics))
+                self._cache["rules"] = self._guess()
         return self._cache["rules"]
+
+    def _guess(self) -> tuple[Rules, Sequence[Guess]]:
+        wanted = _roles(self.topics)
+        here = {role: place for role, place in wanted.items() if any(is_of(one, place) for one in self.columns.columns)}
+        lacking = {role: place for role, place in wanted.items() if role not in here}
+        for role, place in lacking.items():
+            if self.alone:
+                known = ", ".join(self.columns.columns)
+                raise DataError(
+                    f"{self.path} has no {place!r}, which --topic names for {role}; expected one of {known}"
+                )
+        rules, guesses = guess_rules(self.columns, period=self.dt, only=here)
+        how = "--topic names {!r}, which is not in this recording"
+        return rules, [*guesses, *(Guess(role, "", "", how.format(place), True) for role, place in lacking.items())]
 
     def _known(self) -> str | Path | Mapping[str, Any] | None:
         """Return the mapping that was given, or that of a format whose columns are known; else None."""
