@@ -612,6 +612,13 @@ def test_no_command_guesses_silently(tmp_path: Path, capsys: Any, command: Calla
     assert "Guessed" not in capsys.readouterr().err
 
 
+def test_an_error_is_not_covered_by_a_mapping_that_could_not_be_written(tmp_path: Path, capsys: Any) -> None:
+    missing, written = str(tmp_path / "no.mat"), ["--write-mapping", str(tmp_path / "columns.yaml")]
+    for command, recordings in ((replay_main, [missing]), (compare_main, [missing, missing])):
+        assert command([*recordings, *written]) == 2
+        assert "no.mat does not exist" in capsys.readouterr().err
+
+
 def test_a_bag_of_two_joints_has_figures_of_both(tmp_path: Path, capsys: Any) -> None:
     with BagWriter(tmp_path / "bags" / "two") as writer:
         writer.add_topic("/joint_states", "sensor_msgs/msg/JointState")

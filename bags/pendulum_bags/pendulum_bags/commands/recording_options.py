@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -77,13 +78,13 @@ def show_guesses(console: Console, readings: Sequence[Reading], write_to: Path |
     """Print what was guessed, and write it where that is wanted.
 
     Raises:
-        DataError: There is nothing to write.
+        DataError: There is nothing to write, and no other error is on its way.
     """
     from pendulum_bags.recordings.reading import print_guesses, write_mapping
 
     files = [reading for reading in readings if reading.was_mapped]
     print_guesses(console, files)
-    if write_to is not None:
+    if write_to is not None and (files or sys.exc_info()[0] is None):
         if not files:
             raise DataError("--write-mapping has nothing to write: the recordings are bags that need no mapping")
         write_mapping(write_to, files)
