@@ -14,6 +14,9 @@ __all__ = ["Alone", "excluding", "half_width"]
 _SURE = 3.0
 """Standard errors to each side within which a parameter of a recording lies."""
 
+_FEWEST = 3
+"""Recordings that tell how far recordings differ: two of unlike motions differ by what the model lacks in each."""
+
 _MANY = 1e6
 """Degrees of freedom of the recordings' own errors, which already count how few windows they come from."""
 
@@ -64,9 +67,9 @@ def half_width(name: str, alone: Sequence[Alone], error: float, freedom: float) 
     """Return half of the 95 % interval of a parameter of the common fit, and its standard error.
 
     What differs from recording to recording is part of the error, with as few degrees of freedom as there are
-    recordings. It is the most that differs with a confidence of 75 %: where two or three recordings happen to agree, an
+    recordings. It is the most that differs with a confidence of 75 %: where three recordings happen to agree, an
     estimate would be 0. Means of 20 000 draws lie within it in 97 to 98 % where nothing differs, in 94 to 95 % where
-    that is as large as the recordings' errors, and at 5 times them in 88 % of two recordings and 93 % of three.
+    that is as large as the recordings' errors, and at 5 times them in 93 % of three recordings. Two are too few.
 
     Args:
         name: Of the parameter.
@@ -80,7 +83,7 @@ def half_width(name: str, alone: Sequence[Alone], error: float, freedom: float) 
     """
     half = float(student_quantile(0.975, freedom)) * error
     rows = np.array([(one.values[name], one.errors[name]) for one in alone if one.errors.get(name, 0.0) > 0.0])
-    if len(rows) < 2:
+    if len(rows) < _FEWEST:
         return half, error
     values, weights = rows[:, 0], 1.0 / rows[:, 1] ** 2
     total, squares = weights.sum(), np.sum(weights**2)

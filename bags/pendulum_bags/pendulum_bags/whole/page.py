@@ -27,6 +27,10 @@ from pendulum_bags.whole.carry_out import Findings, Simulated
 
 __all__ = ["leave_files_out", "write_whole_report"]
 
+_ERRORS = (
+    "A yes needs all tests: it errs no more often than the one that should have said no, at most in 5 % of experiments "
+    "on a margin. A no needs one test, so their errors add up: 5 % of the first, 2.5 % of the second and of the fourth."
+)
 _FILES = 20.0
 """Processor time to write the page and the files of its figures [s]."""
 
@@ -50,7 +54,8 @@ def write_whole_report(
         for plant, own in zip(found.plants, answers, strict=True):
             _add(figures, tables, plant, own, given=plant is given)
         others = [(plant.name, own) for plant, own in zip(found.plants[1:], answers[1:], strict=True)]
-        return replace(page, figures=figures, tables=tables, others=others, notes=[*page.notes, *found.notes])
+        errors = [_ERRORS] if given.layers else []
+        return replace(page, figures=figures, tables=tables, others=others, notes=[*page.notes, *errors, *found.notes])
 
     # Files for paper take three times as long as the page: what ends early has its plots alone.
     formats = () if found.interrupted or found.spent else ("png", "pdf")
