@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import scipy.integrate
 import scipy.io
+import scipy.signal
 import yaml
 
 from pendulum_bags.commands.analyse_cli import main as analyse_main
@@ -315,3 +316,27 @@ def test_trials_of_several_joints_cost_what_the_plants_lqr_weighs(tmp_path: Path
     assert found["hw"] == pytest.approx([costs["hardware", name] for name in "cba"], rel=1e-6)
     assert found["spearman"] == pytest.approx(-1.0)
     assert "expected --plant, whose LQR weighs them" in ranked(capsys, tmp_path, "--mapping", mapping, code=2)
+
+
+def test_a_disturbance_at_one_joint_is_that_of_all(tmp_path: Path, capsys: Any) -> None:
+    t = 0.01 * np.arange(4000)
+    noise = np.repeat(np.random.default_rng(0).normal(0.0, 2.0, 400), 10)
+    # A cart on a spring and what hangs from it: place, angle, and their rates.
+    a = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0], [-9.0, 0.0, -3.0, 0.0], [9.0, -25.0, 3.0, -4.0]])
+    b = np.array([[0.0], [0.0], [1.0], [-1.0]])
+    paths = []
+    for seed, (name, late) in enumerate((("simulation", 0), ("machine", 4))):
+        felt = np.concatenate([np.zeros(late), noise[: noise.size - late]])
+        motion = scipy.signal.lsim((a, b, np.eye(4), np.zeros((4, 1))), felt, t)[1]
+        rows = np.column_stack([t, motion + np.random.default_rng(seed).normal(0.0, 1e-4, motion.shape), noise])
+        paths.append(str(tmp_path / f"{name}.csv"))
+        header = "time,cart_pos,pole_angle,cart_vel,pole_vel,disturbance"
+        np.savetxt(paths[-1], rows, delimiter=",", header=header, comments="")
+    assert compare_main([*paths, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["answer"]["mark"] == "no"
+    delays = [
+        test["estimate"] for one in found["joints"].values() for test in one["verdict"]["tests"]
+        if test["quantity"] == "delay"
+    ]  # fmt: skip
+    assert delays == [pytest.approx(40.0, abs=2.0)] * 2

@@ -71,12 +71,14 @@ class Shared:
         shift: By how much the second has to be moved to later [s].
         correlation: Of the two, there.
         why: Why it is no more, as text; empty where it is a signal.
+        signals: The signal of each, on the clock of the first; of joints without one, too.
     """
 
     kind: str
     shift: float
     correlation: float
     why: str = ""
+    signals: tuple[Signal | None, Signal | None] = (None, None)
 
 
 def compare_runs(
@@ -241,7 +243,7 @@ def find_shared(simulation: Sequence[RunData], hardware: Sequence[RunData]) -> S
             moved = Signal(other.t + shift, other.value, other.name)
             period = min(ours.window.period, theirs.window.period)
             if not (reason := _unlike(kind, one, moved, correlation, period)):
-                return Shared(kind, shift, correlation)
+                return Shared(kind, shift, correlation, signals=(one, moved))
             turned = Signal(other.t, -other.value, other.name)
             if (opposite := _best_shift([(one, turned)], ours, theirs)[1]) > _ALIKE:
                 reason = (
@@ -344,10 +346,14 @@ def _on_one_clock(simulation: RunData, hardware: RunData, shared: Shared) -> tup
     hardware = hardware.moved(shared.shift)
     start = max(float(simulation.window.t[0]), float(hardware.window.t[0]))
     stop = min(float(simulation.window.t[-1]), float(hardware.window.t[-1]))
-    found = []
-    for run in (simulation, hardware):
-        signal = _SIGNALS[shared.kind](run) if shared.kind in _SIGNALS else None
-        found.append(replace(run.between(start, stop + 1e-9), disturbance=signal))
+    signals = shared.signals
+    if shared.kind in _SIGNALS:
+        own = _SIGNALS[shared.kind](simulation), _SIGNALS[shared.kind](hardware)
+        signals = own if all(one is not None and np.any(one.value) for one in own) else signals
+    found = [
+        replace(run.between(start, stop + 1e-9), disturbance=signal)
+        for run, signal in zip((simulation, hardware), signals, strict=True)
+    ]
     ours, theirs = (run.moved(-start) for run in found)
     _check_guesses(ours, theirs, shared)
     if not _has_one_input(ours, theirs):
