@@ -296,6 +296,7 @@ def test_a_pick_is_made_under_other_noise_than_judges_it_or_has_a_wider_limit():
     # Under the hardware's noise "b" is cheaper in simulation, under other noise "a".
     assert campaign((1, 2, 3)).pick == "b"
     assert campaign((1, 2, 3, 11, 12, 13)).pick == "a"
+    assert not campaign((1, 2, 3, 11, 12, 13)).failures  # of those without seeds
     own, shared = campaign((11, 12, 13)).regret_share, campaign((1, 2, 3)).regret_share
     assert own.value == shared.value == 0.0
     assert 3.0 * own.high < shared.high

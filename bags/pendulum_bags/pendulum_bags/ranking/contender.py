@@ -96,7 +96,8 @@ def with_noise_of_their_own(contenders: Sequence[Contender]) -> tuple[Sequence[C
     found = []
     for one in contenders:
         own = [i for i, seed in enumerate(one.sim_seeds) if seed not in one.hw_seeds]
-        found.append(replace(one, sim=one.sim[own], sim_seeds=tuple(one.sim_seeds[i] for i in own)))
+        rest = replace(one, sim=one.sim[own], sim_seeds=tuple(one.sim_seeds[i] for i in own))
+        found.append(rest if one.sim_seeds else one)  # (seeds that are not known are of no other run)
     return found, False
 
 
