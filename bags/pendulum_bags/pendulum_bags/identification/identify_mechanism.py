@@ -16,7 +16,7 @@ from pendulum_bags.identification.between_recordings import Alone, excluding, ha
 from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED, Explained
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.mechanism_choice import ALL_EXTRAS, choose
-from pendulum_bags.identification.mechanism_doubt import better_reading, refusal
+from pendulum_bags.identification.mechanism_doubt import better_reading, far_off, refusal
 from pendulum_bags.identification.mechanism_fit import (
     MOST,
     MechanismFit,
@@ -57,7 +57,7 @@ _FAST = 0.005
 _POOR = 0.25
 """Share of what straight lines miss from which on a fit is tried again by way of shorter windows."""
 
-_DELAYS = tuple(0.01 * k for k in range(9))
+_DELAYS = tuple(0.01 * k for k in range(13))
 """Delays from which a search may start [s]."""
 
 _CLEARS = 0.2
@@ -221,7 +221,9 @@ class _Search:
         data = self._windows(length)
         first = self._attempt(start, data, length)
         tried = [first] if isinstance(first, _Attempt) else []
-        if DELAY in (self.extras or DELAY) and not (tried and tried[0].fit.worst <= _POOR):
+        # A minimum that is not poor has values of no machine where the search began far below the delay.
+        well = tried and tried[0].fit.worst <= _POOR and far_off(tried[0].fit) is None
+        if DELAY in (self.extras or DELAY) and not well:
             start = self._late(start, data)
             again = self._attempt(start, data, length)
             tried += [again] if isinstance(again, _Attempt) else []
