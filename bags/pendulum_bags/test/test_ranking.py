@@ -281,6 +281,13 @@ def test_a_pick_that_ran_once_is_predicted_from_the_scatter_of_the_other():
     assert limits(found) == pytest.approx(expected, rel=1e-9)
 
 
+def test_runs_that_repeat_one_cost_show_no_scatter_and_are_not_said_to_be_one():
+    equal = {name: np.full((2, 1), cost) for name, cost in (("a", 1.0), ("b", 2.0), ("c", 3.0))}
+    found = rank([Contender(name, costs, costs[::-1]) for name, costs in equal.items()])
+    assert np.isnan(found.regret_share.high)
+    assert found.no_interval == "a, the pick, had one and the same cost in all runs on the hardware, and so did b, c"
+
+
 def test_a_pick_is_made_under_other_noise_than_judges_it_or_has_a_wider_limit():
     def campaign(seeds):
         sim = [*np.full((3, 1), 5.0), *np.full((3, 1), 0.5)]

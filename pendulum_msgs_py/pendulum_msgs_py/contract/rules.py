@@ -109,5 +109,5 @@ def within(value: float, limit: float) -> float:
 
 
 def rise_within(last: float, wanted: float, step: float) -> float:
-    """Return the wanted effort, rising away from zero by at most a step; it falls at once."""
+    """Return the wanted effort, rising from zero by at most a step; torque without a command must fall at once."""
     return min(max(last, 0.0) + step, max(min(last, 0.0) - step, wanted))

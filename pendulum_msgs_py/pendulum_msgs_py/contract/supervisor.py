@@ -147,7 +147,7 @@ class PlantSupervisor:
     # --- transitions ---------------------------------------------------------------------------------------
 
     def arm(self, now_ns: int, sample: JointSample | None) -> str:
-        """Arm for effort at zero torque; return why not, or an empty string."""
+        """Arm for effort at zero torque; return why not, or an empty string. Arming twice changes nothing."""
         if self.mode.armed:
             return ""
         refusal = self._arm_refusal(now_ns, sample)
@@ -252,7 +252,7 @@ class PlantSupervisor:
         return ""
 
     def _keep_pace(self, now_ns: int) -> None:
-        """Shift trajectory and fades by the time in which the process was stopped or the clock stepped."""
+        """Shift trajectory and fades by a stop of the process or a step of the clock: the set point must not jump."""
         last_ns, self._last_time_ns = self._last_time_ns, now_ns
         if last_ns is None:
             return

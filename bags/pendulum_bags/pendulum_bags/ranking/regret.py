@@ -81,11 +81,12 @@ def _lost_share(chosen: Contender, others: Sequence[Contender], *, favoured: boo
 
 
 def _ran_once(chosen: Contender, others: Sequence[Contender]) -> str:
-    once = [one.name for one in others if len(one.hw) == 1]
-    if len(once) == len(others):
+    once = [one.name for one in others if np.ptp(one.hw.sum(axis=1)) == 0.0]
+    if len(once) == len(others) and all(len(one.hw) == 1 for one in (chosen, *others)):
         return "each controller ran once on the hardware"
     named = ", ".join(once[:_NAMED]) + (f" and {len(once) - _NAMED} more" if len(once) > _NAMED else "")
-    return f"{chosen.name}, the pick, ran once on the hardware, and so did {named}"
+    ran = "ran once" if len(chosen.hw) == 1 else "had one and the same cost in all runs"
+    return f"{chosen.name}, the pick, {ran} on the hardware, and so did {named}"
 
 
 def _limits(
