@@ -205,6 +205,9 @@ def test_a_report_of_two_files_shows_what_was_guessed(two: tuple[str, str], tmp_
     assert text.count("(assumed)") >= 2
     assert "tested: 0 hangs down" in text
     assert "recording of the hardware" in text
+    # No plant is known, and what was recorded may hold the disturbance.
+    assert "The recorded input on hardware spends" in text
+    assert not re.search("[Cc]ontrollers? (use|ask|never)|Block diagram|Torque and noise</h3>", text)
     assert not re.search(r">(None|unknown)<", text)
     assert compare_main([*two, "--mapping", str(written), "--json"]) == 0
     assert "What was guessed" not in capsys.readouterr().out

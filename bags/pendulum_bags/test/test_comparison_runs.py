@@ -186,7 +186,7 @@ def test_figures_of_several_runs_are_those_of_all_their_samples(tmp_path: Path) 
         "All samples of 2 runs, so that a run counts by their number"
     )
     alone = compare_folders(folders[:1])
-    assert make_tables(ReportData(alone, {}))[0].sentence.startswith("The controllers ask for at most")
+    assert make_tables(ReportData(alone, {}))[0].sentence.startswith("The torque is at most")
 
 
 def test_the_terminal_says_of_which_samples_its_figures_are(

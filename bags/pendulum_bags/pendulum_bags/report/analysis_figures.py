@@ -249,8 +249,9 @@ def effort(data: ReportData) -> Figure:
     ]
     ratio = float(heat[1][3][-1] / heat[0][3][-1]) if heat[0][3][-1] > 0.0 else float("nan")
     sign = "takes energy out of" if work[1][3][-1] < 0.0 else "puts energy into"
+    whose = "recorded input" if data.comparison.of_files else "controller"
     sentence = (
-        f"The controller on hardware spends ∫u² dt = {quantity(float(heat[1][3][-1]), 'N² m² s')}, "
+        f"The {whose} on hardware spends ∫u² dt = {quantity(float(heat[1][3][-1]), 'N² m² s')}, "
         f"{ratio_in_words(ratio)} than in simulation; it {sign} the hardware "
         f"({quantity(float(work[1][3][-1]), 'J')})."
     ).replace("equal within half a per cent than", "within half a per cent of what it spends")

@@ -65,7 +65,9 @@ class ReportData:
 
     @cached_property
     def plant(self) -> PlantParameters | None:
-        """Return the plant that the run was designed on."""
+        """Return the plant that the run was designed on; None where that is not known."""
+        if self.comparison.of_files and "plant" not in self.run:
+            return None
         try:
             return load_plant(str(self.run.get("plant", "thesis")))
         except ParameterError:

@@ -20,7 +20,7 @@ def overdamped_phase(data: ReportData) -> Figure | str:
     """Return theta' over theta of the overdamped limit b theta' + G sin theta = u0, with its fixed points."""
     plant = data.plant
     if plant is None:
-        return "the plant file of the run cannot be read"
+        return "no plant file of the run can be read"
     theta = np.linspace(-math.pi / 2, 2.0 * math.pi, 601)
     half = 0.5 * plant.gravity
     traces = [

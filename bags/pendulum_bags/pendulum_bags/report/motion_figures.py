@@ -41,7 +41,8 @@ def _deviation(series: Series) -> Array:
 
 def _under_noise(run: RunData, role: str, name: str, title: str) -> Figure:
     window = run.window
-    torque = [Trace(window.t, window.effort, "controller torque u", role, "step")]
+    whose = "recorded" if run.of_file else "controller"
+    torque = [Trace(window.t, window.effort, f"{whose} torque u", role, "step")]
     if run.disturbance is not None:
         torque.insert(0, Trace(run.disturbance.t, run.disturbance.value, "noise d", "noise", "step"))
     hold = noise_hold_time(run)
@@ -49,8 +50,8 @@ def _under_noise(run: RunData, role: str, name: str, title: str) -> Figure:
     sentence = (
         f"Under uniform noise{held}, the angle stays within {quantity(float(np.abs(_deviation(window)).max()), 'rad')} "
         f"of upright (standard deviation {quantity(float(window.position.std(ddof=1)), 'rad')}, "
-        f"of the velocity {quantity(float(window.velocity.std(ddof=1)), 'rad/s')}), and the controller never asks for "
-        f"more than {quantity(float(np.abs(window.effort).max()), 'N m')}."
+        f"of the velocity {quantity(float(window.velocity.std(ddof=1)), 'rad/s')}), and the {whose} torque is at most "
+        f"{quantity(float(np.abs(window.effort).max()), 'N m')}."
     )
     panels = [
         Panel(TIME, ANGLE, [Trace(window.t, _deviation(window), "", role)]),
@@ -95,7 +96,13 @@ def both_together(data: ReportData) -> Figure:
     panels = [
         both_panel(ANGLE, sim, hw, _deviation),
         both_panel(VELOCITY, sim, hw, attrgetter("velocity")),
-        both_panel("controller torque u [N m]", sim, hw, attrgetter("effort"), "step"),
+        both_panel(
+            f"{'recorded' if pair.hardware.of_file else 'controller'} torque u [N m]",
+            sim,
+            hw,
+            attrgetter("effort"),
+            "step",
+        ),
     ]
     return Figure(
         "both_together",
@@ -113,6 +120,8 @@ def torque_and_noise(data: ReportData) -> Figure | str:
     noise = pair.hardware.disturbance or pair.simulation.disturbance
     if noise is None:
         return "no disturbance was recorded"
+    if data.comparison.of_files:
+        return "whether the recorded input holds the disturbance is not known"
     sim, hw = pair.simulation.window, pair.hardware.window
     largest = float(np.abs(noise.value).max())
     reach = max(float(np.abs(sim.effort).max()), float(np.abs(hw.effort).max()))

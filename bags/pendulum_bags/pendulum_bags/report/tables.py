@@ -64,7 +64,8 @@ def _plants(data: ReportData) -> Table:
     runs = len(data.comparison.pairs)
     pooled = f"All samples of {runs} runs, so that a run counts by their number. " if runs > 1 else ""
     sentence = (
-        f"{pooled}The controllers ask for at most {quantity(max(sim['max_abs_u'], hw['max_abs_u']), 'N m')}; "
+        f"{pooled}The torque is at most "
+        f"{quantity(max(sim['max_abs_u'], hw['max_abs_u']), 'N m')}; "
         f"{int(sim['missed_deadlines'])} deadlines were missed in simulation and {int(hw['missed_deadlines'])} on "
         f"hardware. {seen_note(data.comparison)}"
     )
