@@ -11,7 +11,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,10 +23,9 @@ from pendulum_lqr.linear.design import Gain
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, is_mechanism, load_mechanism
 
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
 __all__ = ["ClosedLoops", "Columns"]
+
+_Loops = TypeVar("_Loops", bound="ClosedLoops")
 
 Columns = dict[str, NDArray[Any]]
 """Columns of a table by name, shape (n,) each; SI units."""
@@ -68,7 +67,7 @@ class ClosedLoops:
     device: str = "cpu"
 
     @classmethod
-    def of(cls, plant: str, **given: Any) -> Self:
+    def of(cls: type[_Loops], plant: str, **given: Any) -> _Loops:
         """Return the settings for a plant of any number of joints, with the defaults that it has."""
         several = {"uncertainty": Uncertainty(), "method": "auto", **cls.OF_SEVERAL} if is_mechanism(plant) else {}
         return cls(plant=plant, **{**several, **given})
