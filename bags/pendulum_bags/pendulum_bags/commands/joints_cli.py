@@ -122,7 +122,7 @@ def joints(
         # Before anything runs: a slip of the pen should not cost a minute.
         on = design_for(simulated)
         read_designs(design, on, linearise(on))
-    budget = budget_of(budget, contenders, seeds)
+    budget = budget_of(budget, contenders, seeds, joints=True)
     margins, steps = Margins.of(margins_file, margin), steps_of(only, budget)
 
     def order_in(folder: Path) -> Order:

@@ -48,8 +48,8 @@ Budget = Annotated[
     float | None,
     typer.Option(
         help="Longest wall time of what follows the first run, where hardware is emulated: repeats, identification, "
-        "further layers, the page; 0 for that run alone. By default 120 for 6 contenders under 3 seeds, and 1.5 for "
-        "each further run of the ranking [s].",
+        "further layers, the page; 0 for that run alone. By default 120 for 6 contenders under 3 seeds (240 with "
+        "several joints), and 1.5 (5) for each further run of the ranking [s].",
         min=0.0,
     ),
 ]
@@ -72,9 +72,10 @@ Design = Annotated[
 ]
 
 
-def budget_of(given: float | None, contenders: int, seeds: int) -> float:
+def budget_of(given: float | None, contenders: int, seeds: int, *, joints: bool = False) -> float:
     """Return the budget of a run: the given one, or what its ranking needs [s]."""
-    return 120.0 + 1.5 * max(0, contenders * seeds - 18) if given is None else given
+    usual, each = (240.0, 5.0) if joints else (120.0, 1.5)
+    return usual + each * max(0, contenders * seeds - 18) if given is None else given
 
 
 def steps_of(only: Sequence[str] | None, budget: float) -> Sequence[str]:

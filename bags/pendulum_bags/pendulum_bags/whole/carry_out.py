@@ -121,8 +121,9 @@ class Order:
     def expected_wall_time(self) -> float:
         """Wall time of all steps, measured on two cores [s]."""
         further = 0.0 if self.alone else 4.0 + 18.0 * (IDENTIFIED in self.steps)
-        further += 6.0 * self.in_frequency
-        further += (5.0 + 1.2 * self.seeds * self.contenders) * self.wants(Layer.SAME_CHOICE)
+        each, multisine = (4.5, 35.0) if isinstance(self.settings, JointSettings) else (1.2, 6.0)
+        further += multisine * self.in_frequency
+        further += (5.0 + each * self.seeds * self.contenders) * self.wants(Layer.SAME_CHOICE)
         return self.settings.expected_wall_time + further
 
     def wants(self, *layers: Layer) -> bool:
@@ -400,6 +401,11 @@ class _Run:
         if plant.comparisons and self.contenders:
             yield partial(self._simulate_contenders, plant)
 
+    @property
+    def _pace(self) -> float:
+        """Wall time in which the machine records a second, on two cores: 100 or 500 samples."""
+        return 0.8 if isinstance(self.order.settings, JointSettings) else 0.1
+
     def _phase(self, name: str, seconds: float) -> None:
         self.now = name
         self.progress.phase(name, seconds)
@@ -450,7 +456,8 @@ class _Run:
 
     def _frequencies(self, plant: Simulated) -> None:
         """Compare a plant with the machine in frequency, and certify designs on it."""
-        self._phase(f"frequencies of {plant.name}", 3.0)
+        excited = 0.0 if plant is self.found.identified else self._pace * self.multisine.duration
+        self._phase(f"frequencies of {plant.name}", 3.0 + excited)
         own, machine = plant.folder / MULTISINE / "sim", self.folder / MULTISINE / "hw"
         self.found.deadline.require(_ANALYSING)
         record_simulation(own, _of(plant, self.multisine))
@@ -472,7 +479,9 @@ class _Run:
         simulate_contenders(plant.folder / RANKING, specs, partial(self.found.deadline.require, _SIMULATING))
 
     def _machine_contenders(self) -> None:
-        self._phase(f"{len(self.contenders)} controllers on the hardware", 3.0 * len(self.contenders))
+        runs = [theirs for both in self.contenders.values() for _, theirs in both]
+        expected = sum(0.5 + self._pace * run.duration for run in runs)
+        self._phase(f"{len(self.contenders)} controllers on the hardware", expected)
         for name, both in self.contenders.items():
             for _, spec in both:
                 place, failure = place_of(self.folder / RANKING, name, spec), ""
