@@ -223,8 +223,8 @@ class _Search:
         tried = [first] if isinstance(first, _Attempt) else []
         # A minimum that is not poor has values of no machine where the search began far below the delay.
         well = tried and tried[0].fit.worst <= _POOR and far_off(tried[0].fit) is None
-        if DELAY in (self.extras or DELAY) and not well:
-            start = self._late(start, data)
+        if DELAY in (self.extras or DELAY) and not well and (late := self._late(start, data)) is not None:
+            start = late
             again = self._attempt(start, data, length)
             tried += [again] if isinstance(again, _Attempt) else []
         shortest = None
@@ -246,16 +246,21 @@ class _Search:
             raise DataError(better_reading(self.plant, data) or str(first))
         return best
 
-    def _late(self, start: MechanismModel, data: list[Windows]) -> MechanismModel:
-        """Return the start with the delay that explains most: a search from far below it ends in a poor minimum."""
-        at, weights, costs = start.index([DELAY]), first_weights(data), {}
-        for delay in (start[DELAY], *_DELAYS):
+    def _late(self, start: MechanismModel, data: list[Windows]) -> MechanismModel | None:
+        """Return the start with the delay that explains most; None where that is its own.
+
+        A search from far below the delay ends in a poor minimum.
+        """
+        at, weights, costs = start.index([DELAY]), first_weights(data), dict[float, float]()
+        models = dict[float, MechanismModel]()
+        for delay in dict.fromkeys((start[DELAY], *_DELAYS)):
             values = start.values.copy()
             values[at] = delay
-            late = start.with_values(values)
+            models[delay] = start.with_values(values)
             with suppress(DataError):
-                costs[fit(late, data, (), weights, most=4, tolerance=1e-2).cost] = late
-        return costs[min(costs)] if costs else start
+                costs[delay] = fit(models[delay], data, (), weights, most=4, tolerance=1e-2).cost
+        best = min(costs, key=costs.__getitem__, default=start[DELAY])
+        return None if best == start[DELAY] else models[best]
 
     def _windows(self, length: float) -> list[Windows]:
         data = [prepare_windows(recording, length, stride=self.stride) for recording in self.recordings]

@@ -55,7 +55,7 @@ def choose(
     model, states = start, None
     for name, wanted in EXTRAS.items():
         free = start.fitted(**wanted)
-        if (name != extras if extras else name == ALL_EXTRAS) or free in [b[1].free for b in ([best] if best else [])]:
+        if (name != extras if extras else name == ALL_EXTRAS) or (best is not None and free == best[1].free):
             continue
         found = fit(model, data, free, weights, states=states, tolerance=1e-4, hopeless=LARGEST_SHARE)
         if extras is not None:
