@@ -208,6 +208,13 @@ class Judged:
     robust: bool
 
 
+def _task(truth: Linear, known: LinearModel, q: Array, r: float) -> tuple[float, SignalScaling]:
+    """Return the highest frequency of a recording [Hz], and the units of the gap that the product takes."""
+    if truth.joints == 1:
+        return 0.95 * 0.5 / truth.period, DEFAULT_SCALING
+    return 100.0, JointScaling.of_weights(known.measured, ["-"] * len(q), list(q), r, "-")
+
+
 def judge(model: Linear, truth: Linear, q: Array, r: float, seed: int, cases: int, length: float = 4.0) -> list[Judged]:
     """Return cases of one pair: regulators of random weights, scaled and rotated.
 
@@ -223,14 +230,11 @@ def judge(model: Linear, truth: Linear, q: Array, r: float, seed: int, cases: in
     held = model.regulator(q, r)
     if truth.modulus(held) >= 1.0:
         return []
-    top = 0.95 * 0.5 / truth.period if truth.joints == 1 else 100.0
-    response = estimate(measured(truth, held, seed, length=length, top=top))
     known = model.model()
-    if truth.joints == 1:
-        certifier = Certifier(known, Machine.of(response), DEFAULT_SCALING)
-    else:
-        scaling = JointScaling.of_weights(known.measured, ["-"] * len(q), list(q), r, "-")
-        certifier = Certifier(known, Machine.relative_to(response, known), scaling)
+    top, scaling = _task(truth, known, q, r)
+    response = estimate(measured(truth, held, seed, length=length, top=top))
+    machine = Machine.of(response) if truth.joints == 1 else Machine.relative_to(response, known)
+    certifier = Certifier(known, machine, scaling)
     random, found = np.random.default_rng([9, seed]), []
     for _ in range(cases):
         weights = q * 10.0 ** random.uniform(-0.5, 1.5, len(q))
@@ -311,12 +315,10 @@ def distance(name: str, seed: int) -> tuple[Interval, float] | None:
     held = model.regulator(q, r)
     if truth.modulus(held) >= 1.0:
         return None
-    known, top = model.model(), 47.5 if truth.joints == 1 else 100.0
+    known = model.model()
+    top, scaling = _task(truth, known, q, r)
     simulation = replace(model, period=0.002, amplitude=truth.amplitude)
     both = [estimate(measured(one, held, at, top=top)) for one, at in ((simulation, seed + 10**6), (truth, seed))]
-    scaling: SignalScaling = DEFAULT_SCALING
-    if truth.joints > 1:
-        scaling = JointScaling.of_weights(known.measured, ["-"] * len(q), list(q), r, "-")
     found = compare_responses(both[0], both[1], known, scaling)
     graphs = []
     for one in (replace(model, period=truth.period), truth):

@@ -99,7 +99,7 @@ def ranking(
             "Numbers of the tables." if not readings else COST if plant else words.cost,
         )
     emulated = all(one.emulated for one in contenders)
-    seeded = any(set(one.sim_seeds) & set(one.hw_seeds) for one in contenders)
+    seeded = any(one.shared_seeds for one in contenders)
     use = (not emulated and seeded) if use_simulation is None else use_simulation
     narrowed = narrow_all(contenders) if use else {}
     page = write_ranking(out, found, words=words, emulated=emulated, case=case) if out is not None else None

@@ -10,8 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pendulum_bags.experiments.run_spec import PERIODS
 from pendulum_bags.frequency_response.compare import compare_responses
-from pendulum_bags.frequency_response.designs import SIMULATED, DesignResult, certify_designs, policies_of
+from pendulum_bags.frequency_response.designs import DesignResult, certify_designs, policies_of
 from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.layers import GAP_MARGIN, LONGER, same_plant, which_controllers
 from pendulum_bags.frequency_response.record import Record, record_of_joints, record_of_run
@@ -158,7 +159,7 @@ def analyse_responses(
         difference = compare_responses(by_label["sim"], by_label["hw"], model, scaling)
         layers.append(same_plant(by_label["sim"], by_label["hw"], difference, margin, longer=longer))
     if certifier is not None:
-        period = by_label["sim"].period if "sim" in by_label else SIMULATED
+        period = by_label["sim"].period if "sim" in by_label else PERIODS["sim"]
         results = certify_designs(designs, own, certifier, recorded=recorded, period=period)
         layers.append(which_controllers(certifier, results, longer=longer))
     case = Case(*(str(by_label[side].facts.get(IDENTITY, "")) if side in by_label else "" for side in ("sim", "hw")))

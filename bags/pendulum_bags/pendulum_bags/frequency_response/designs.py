@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_bags.experiments.run_spec import PERIODS
 from pendulum_lqr.design_command.design_cli import THESIS_WEIGHTS
 from pendulum_lqr.linear.design import output_lqr
 from pendulum_lqr.linear.model import LinearModel
@@ -33,8 +34,6 @@ __all__ = [
     "read_designs",
 ]
 
-SIMULATED = 0.002
-"""Period of a simulation that was not recorded [s]: the simulator's default."""
 _NUMBERS = r"[-+0-9.eE]+(?:,[-+0-9.eE]+)*"
 _WEIGHTS = re.compile(rf"q=({_NUMBERS})(?:[ ;]+r=({_NUMBERS}))?")
 _GAIN = re.compile(rf"k=({_NUMBERS})")
@@ -117,7 +116,7 @@ def certify_designs(
     certifier: Certifier,
     *,
     recorded: bool = False,
-    period: float = SIMULATED,
+    period: float = PERIODS["sim"],
 ) -> list[DesignResult]:
     """Return the certificates of designs that were made on a plant.
 

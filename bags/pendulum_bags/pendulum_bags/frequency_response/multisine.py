@@ -30,6 +30,11 @@ class Multisine:
     highest: float = 47.5
     lines: int = 48
 
+    @property
+    def duration(self) -> float:
+        """Length of a run [s]."""
+        return self.signal_period * (self.periods + 1) + 0.1
+
     def specs(self, sim: RunSpec, hw: RunSpec) -> tuple[RunSpec, RunSpec]:
         """Return both sides' runs under the multisine; a ParameterError if the simulation is too slow for it."""
         if (foreign := sim.foreign) is not None:
@@ -45,8 +50,7 @@ class Multisine:
             "lines": self.lines,
             "hold_time": _HOLD_TIME,
         }
-        duration = self.signal_period * (self.periods + 1) + 0.1
-        ours, theirs = (replace(spec, disturbance=disturbance, duration=duration) for spec in (sim, hw))
+        ours, theirs = (replace(spec, disturbance=disturbance, duration=self.duration) for spec in (sim, hw))
         return ours, theirs
 
     def _of_joints(self, spec: RunSpec) -> RunSpec:
@@ -64,5 +68,5 @@ class Multisine:
             "lines": self.lines,
             "hold_time": spec.period,
         }
-        duration = self.signal_period * (self.periods + 1) + 0.1
-        return replace(spec, disturbance=disturbance, duration=duration, controller="lqr", controller_parameters={})
+        length = self.duration
+        return replace(spec, disturbance=disturbance, duration=length, controller="lqr", controller_parameters={})

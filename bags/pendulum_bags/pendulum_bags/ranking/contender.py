@@ -52,6 +52,11 @@ class Contender:
         rows = self.sim if side == "sim" else self.hw
         return np.asarray(rows.mean(axis=0), dtype=np.float64)
 
+    @property
+    def shared_seeds(self) -> set[int]:
+        """Seeds under which it ran on both sides."""
+        return set(self.sim_seeds) & set(self.hw_seeds)
+
     def by_seed(self, side: str) -> dict[int, float]:
         """Return the mean cost under each seed on a side: runs that repeat a seed are no independent ones."""
         rows, seeds = (self.sim, self.sim_seeds) if side == "sim" else (self.hw, self.hw_seeds)
@@ -90,12 +95,12 @@ def with_noise_of_their_own(contenders: Sequence[Contender]) -> tuple[Sequence[C
     They are left where a contender has no others: a simulation that picks under the noise that judges its pick picks
     what this noise favours.
     """
-    shared = any(set(one.sim_seeds) & set(one.hw_seeds) for one in contenders)
-    if not shared or any(one.sim_seeds and not set(one.sim_seeds) - set(one.hw_seeds) for one in contenders):
+    shared = any(one.shared_seeds for one in contenders)
+    if not shared or any(one.sim_seeds and one.shared_seeds == set(one.sim_seeds) for one in contenders):
         return contenders, shared
     found = []
     for one in contenders:
-        own = [i for i, seed in enumerate(one.sim_seeds) if seed not in one.hw_seeds]
+        own = [i for i, seed in enumerate(one.sim_seeds) if seed not in one.shared_seeds]
         rest = replace(one, sim=one.sim[own], sim_seeds=tuple(one.sim_seeds[i] for i in own))
         found.append(rest if one.sim_seeds else one)  # (seeds that are not known are of no other run)
     return found, False

@@ -50,6 +50,7 @@ from pendulum_bags.verdict.answer import answer_of
 from pendulum_bags.verdict.same_run import case_of, recordings_of
 from pendulum_bags.whole.contenders import (
     CONTENDERS,
+    LENGTH,
     SEEDS,
     contender_specs,
     keep_run,
@@ -121,10 +122,14 @@ class Order:
     def expected_wall_time(self) -> float:
         """Wall time of all steps, measured on two cores [s]."""
         further = 0.0 if self.alone else 4.0 + 18.0 * (IDENTIFIED in self.steps)
-        each, multisine = (4.5, 35.0) if isinstance(self.settings, JointSettings) else (1.2, 6.0)
-        further += multisine * self.in_frequency
-        further += (5.0 + each * self.seeds * self.contenders) * self.wants(Layer.SAME_CHOICE)
+        further += (3.0 + self.recording_time(self.multisine.duration)) * self.in_frequency
+        ranked = self.recording_time(LENGTH) * self.seeds * self.contenders
+        further += (5.0 + ranked) * self.wants(Layer.SAME_CHOICE)
         return self.settings.expected_wall_time + further
+
+    def recording_time(self, duration: float) -> float:
+        """Return the wall time in which the machine records a run of a duration, at 100 or 500 samples a second [s]."""
+        return 0.5 + (0.8 if isinstance(self.settings, JointSettings) else 0.1) * duration
 
     def wants(self, *layers: Layer) -> bool:
         """Return whether one of some layers is asked for."""
@@ -146,7 +151,7 @@ class Simulated:
         folder: Of its recordings.
         budget: That of the next run where this one's did not suffice; 0 where more of it measures nothing [s].
         comparisons: Of each joint; empty before the first analysis.
-        refused: Why no other plant could be identified from these recordings; empty where nobody tried.
+        refused: Why no other plant could be identified from these recordings; empty where none was tried.
     """
 
     name: str
@@ -401,11 +406,6 @@ class _Run:
         if plant.comparisons and self.contenders:
             yield partial(self._simulate_contenders, plant)
 
-    @property
-    def _pace(self) -> float:
-        """Wall time in which the machine records a second, on two cores: 100 or 500 samples."""
-        return 0.8 if isinstance(self.order.settings, JointSettings) else 0.1
-
     def _phase(self, name: str, seconds: float) -> None:
         self.now = name
         self.progress.phase(name, seconds)
@@ -456,7 +456,7 @@ class _Run:
 
     def _frequencies(self, plant: Simulated) -> None:
         """Compare a plant with the machine in frequency, and certify designs on it."""
-        excited = 0.0 if plant is self.found.identified else self._pace * self.multisine.duration
+        excited = 0.0 if plant is self.found.identified else self.order.recording_time(self.multisine.duration)
         self._phase(f"frequencies of {plant.name}", 3.0 + excited)
         own, machine = plant.folder / MULTISINE / "sim", self.folder / MULTISINE / "hw"
         self.found.deadline.require(_ANALYSING)
@@ -480,7 +480,7 @@ class _Run:
 
     def _machine_contenders(self) -> None:
         runs = [theirs for both in self.contenders.values() for _, theirs in both]
-        expected = sum(0.5 + self._pace * run.duration for run in runs)
+        expected = sum(self.order.recording_time(run.duration) for run in runs)
         self._phase(f"{len(self.contenders)} controllers on the hardware", expected)
         for name, both in self.contenders.items():
             for _, spec in both:

@@ -21,7 +21,16 @@ from pendulum_bags.studies.results import write_outcome
 from pendulum_bags.studies.study_file import load_study
 from pendulum_msgs_py.errors import PendulumError
 
-__all__ = ["CONTENDERS", "MOST", "contender_specs", "keep_run", "place_of", "rank_folders", "simulate_contenders"]
+__all__ = [
+    "CONTENDERS",
+    "LENGTH",
+    "MOST",
+    "contender_specs",
+    "keep_run",
+    "place_of",
+    "rank_folders",
+    "simulate_contenders",
+]
 
 CONTENDERS, MOST = 6, 32
 """Controllers that a ranking compares by default, and at most."""
@@ -33,8 +42,8 @@ OWN_NOISE = 3_000_000
 """Added to the seeds of the simulation: it picks under other noise than that which judges its pick."""
 _COSTS, _VELOCITIES, _POSITIONS = (1.0, 100.0, 10.0, 0.1, 1e3, 0.01), (1.0, 30.0), (1.0, 10.0, 0.1)
 """By what the weights of several joints' own LQR are multiplied: those of efforts, velocities and positions."""
-_LENGTH = 5.0
-"""Longest noise under which controllers of several joints run [s]."""
+LENGTH = 5.0
+"""Longest noise under which controllers run [s]."""
 _PROBE = 1.0
 """Length of the run that shows whether two controllers differ [s]."""
 
@@ -52,7 +61,7 @@ def _laws(spec: RunSpec) -> dict[str, dict[str, Any]]:
         return {name: named[name] for name in dict.fromkeys((*_FIRST, *named))}
     weights, cost = mechanism.mechanism.weights
     half = len(weights) // 2
-    noise = {"duration": min(spec.duration, _LENGTH)}
+    noise = {"duration": min(spec.duration, LENGTH)}
     laws: dict[str, dict[str, Any]] = {}
     for stiff, quick, dear in product(_POSITIONS, _VELOCITIES, _COSTS):
         q = [*(stiff * one for one in weights[:half]), *(quick * one for one in weights[half:])]
