@@ -28,8 +28,9 @@ from pendulum_bags.whole.carry_out import Findings, Simulated
 __all__ = ["leave_files_out", "write_whole_report"]
 
 _ERRORS = (
-    "A yes needs all tests: it errs no more often than the one that should have said no, at most in 5 % of experiments "
-    "on a margin. A no needs one test, so their errors add up: 5 % of the first, 2.5 % of the second and of the fourth."
+    "A yes needs all tests that were measured: it errs no more often than the one that should have said no, at most in "
+    "5 % of experiments on a margin. A no needs one test, so their errors add up: 5 % of the first, 2.5 % of the "
+    "second and of the fourth, and the stable designs that the third does not certify."
 )
 _FILES = 20.0
 """Processor time to write the page and the files of its figures [s]."""
