@@ -133,17 +133,15 @@ def test_hand_over_to_lqr_makes_no_jump_in_torque(run_folder: Path) -> None:
         bag = read_bag(run_folder / name)
         times = {event["name"]: event["stamp_ns"] for event in bag.events()}
         applied = bag[f"/{name}/applied_effort"]
-        # The controller is activated at ``regulation`` and takes over within a few periods.
-        about = (applied["stamp_ns"] > times["regulation"] - 50_000_000) & (
-            applied["stamp_ns"] < times["noise_start"] - 20_000_000
-        )
-        assert about.sum() > 50
-        before, after = applied["effort"][about][:-1], applied["effort"][about][1:]
-        # On a busy machine a controller may fall silent for a while, which ends its torque at once.
-        regulated = [event for event in bag.events() if event["stamp_ns"] > times["regulation"]]
-        starved = any("no fresh command" in str(event.get("reason")) for event in regulated)
-        told = (before != 0.0) & (after != 0.0) if starved else np.ones(before.shape, np.bool_)
-        assert np.abs(after - before)[told].max() < 0.5
+        # The ramp ends at speed: its torque against friction falls until the controller takes over.
+        changes = [(str(event.get("reason")), event["stamp_ns"]) for event in bag.events()]
+        start = next(stamp for reason, stamp in changes if reason.startswith("commanded by"))
+        # On a busy machine a controller may fall silent: its torque ends at once, and what catches the fall is large.
+        silences = [stamp for reason, stamp in changes if "no fresh command" in reason and stamp > start]
+        end = min([times["noise_start"] - 20_000_000, *silences])
+        first, last = np.searchsorted(applied["stamp_ns"], (start, end))
+        assert last - first > 50 or silences
+        assert np.abs(np.diff(applied["effort"][first - 1 : last])).max(initial=0.0) < 1.0
 
 
 def test_both_plants_got_the_same_noise(run_folder: Path) -> None:
