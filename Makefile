@@ -5,7 +5,7 @@ SHELL := /bin/sh
 unexport PYTHONDONTWRITEBYTECODE
 .DELETE_ON_ERROR:
 
-PACKAGES := pendulum_msgs_py pendulum_sim pendulum_lqr pendulum_hw_bridge bags/pendulum_rosbag bags/pendulum_bags tests/pendulum_testing
+PACKAGES := pendulum_msgs_py pendulum_sim pendulum_lqr pendulum_hw_bridge bags/pendulum_rosbag bags/pendulum_bags bags/pendulum_console bags/pendulum_learning bags/pendulum_course tests/pendulum_testing
 VENV := .venv
 PY := $(VENV)/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check --no-input --quiet --quiet
@@ -61,7 +61,7 @@ experiment: $(VENV)/.linked # Run the thesis's experiment on simulator and emula
 	@$(PY) -m pendulum_bags experiment thesis $(if $(OUT),--out "$(OUT)") $(ARGS)
 
 course: $(VENV)/.linked $(VENV)/.extras # Make six exercises with a hidden plant from a seed (SEED=2027 OUT=build/course)
-	@$(PY) -m pendulum_bags course make $(if $(SEED),--seed "$(SEED)") $(if $(OUT),--out "$(OUT)")
+	@$(PY) -m pendulum_course course make $(if $(SEED),--seed "$(SEED)") $(if $(OUT),--out "$(OUT)")
 
 test: venv # Run every test (ARGS="-k name" chooses)
 	@$(PY) -m tests.suite $(ARGS)

@@ -22,6 +22,9 @@ for _package in (
     "pendulum_hw_bridge",
     "pendulum_rosbag",
     "pendulum_bags",
+    "pendulum_console",
+    "pendulum_learning",
+    "pendulum_course",
 ):
     importlib.import_module(_package)
 

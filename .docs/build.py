@@ -22,7 +22,16 @@ if TYPE_CHECKING:
 PROJECT = Path(__file__).resolve().parents[1]
 GATHERED = PROJECT / "build" / "docs"
 REFERENCE = PROJECT / "pendulum_msgs_py" / "docs" / "reference.md"
-PACKAGES = ("pendulum_sim", "pendulum_hw_bridge", "pendulum_lqr", "pendulum_rosbag", "pendulum_bags")
+PACKAGES = (
+    "pendulum_sim",
+    "pendulum_hw_bridge",
+    "pendulum_lqr",
+    "pendulum_rosbag",
+    "pendulum_bags",
+    "pendulum_console",
+    "pendulum_learning",
+    "pendulum_course",
+)
 NODES = (
     ("simulator", "pendulum_sim.simulator.simulator_node", ("SPECS",)),
     ("mujoco", "pendulum_sim.simulator.engines", ("MUJOCO",)),

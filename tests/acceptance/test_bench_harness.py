@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_bags.learning.task import VARIED
+from pendulum_learning.task import VARIED
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from tests.benchmarks import Peer, Row, bench_learn, measured, peer, run
 from tests.benchmarks.limit_loop import build_limit

@@ -288,10 +288,10 @@ def test_json_of_a_table_is_json(capsys: pytest.CaptureFixture[str]) -> None:
     assert "m_stop" in json.loads(capsys.readouterr().out)["faults"]
 
 
-@pytest.mark.parametrize("program", ["experiment", "course"])
+@pytest.mark.parametrize("program", ["pendulum_bags experiment", "pendulum_course course"])
 def test_a_help_of_80_columns_has_the_whole_summary_of_each_command(program: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "pendulum_bags", program, "--help"],
+        [sys.executable, "-m", *program.split(), "--help"],
         env={**os.environ, "COLUMNS": "80"},
         capture_output=True,
         text=True,

@@ -19,8 +19,8 @@ from typing import Any
 
 import pytest
 
-from pendulum_bags.console.security import refusal
 from pendulum_bags.verdict.layers import Layer, LayerResult, Mark, sum_up
+from pendulum_console.console.security import refusal
 from pendulum_testing.fixtures import PROJECT, own_domain, wait_for
 from pendulum_testing.npm import install_packages
 from pendulum_testing.processes import ProcessGroup, RunningProgram
@@ -100,7 +100,7 @@ def test_the_page_doubts_a_silent_server_and_gives_its_orders_to_the_next() -> N
     """The page's script alone: what it sends and shows while servers come and go, and when it is loaded anew."""
     if (node := shutil.which("node")) is None:
         pytest.skip("no node on this machine")
-    script = PROJECT / "bags" / "pendulum_bags" / "pendulum_bags" / "console" / "static" / "console.js"
+    script = PROJECT / "bags" / "pendulum_console" / "pendulum_console" / "console" / "static" / "console.js"
     ended = subprocess.run(
         [node, Path(__file__).with_name("console_page.cjs"), script],
         capture_output=True,
@@ -167,7 +167,9 @@ def bench(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
             simulator = processes.start("pendulum_sim", "simulator", *at, "-p", "start:=top", "-p", "rate_hz:=100.0")
             processes.start("pendulum_lqr", "controller", *at, "-p", "period:=0.01")
             processes.start("pendulum_lqr", "disturbance", *at)
-            console = processes.start("pendulum_bags", "console", "--port", port, "--runs", folder / "runs", alone=True)
+            console = processes.start(
+                "pendulum_console", "console", "--port", port, "--runs", folder / "runs", alone=True
+            )
             console.wait_for_output(r"console at http://localhost", 60)
             yield Bench(processes, simulator, f"http://localhost:{port}/", folder / "runs")
         finally:
@@ -302,7 +304,9 @@ def test_a_controller_that_the_page_started_ends_with_the_console_where_it_survi
         port = probe.getsockname()[1]
     try:
         processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", "-p", "rate_hz:=100.0")
-        console = processes.start("pendulum_bags", "console", "--port", port, "--runs", tmp_path / "runs", alone=True)
+        console = processes.start(
+            "pendulum_console", "console", "--port", port, "--runs", tmp_path / "runs", alone=True
+        )
         address = console.wait_for_output(r"console at (\S+)", 60)[1]
         page = _open(chromium, address)
         page.get_by_role("button", name="Start controller /sim").click()

@@ -1,4 +1,4 @@
-"""Wheels and source archives of the six packages: built without a network, installed into an empty folder, run."""
+"""Wheels and source archives of the packages: built without a network, installed into an empty folder, run."""
 
 from __future__ import annotations
 
@@ -26,6 +26,9 @@ FOLDERS = (
     "pendulum_hw_bridge",
     "bags/pendulum_rosbag",
     "bags/pendulum_bags",
+    "bags/pendulum_console",
+    "bags/pendulum_learning",
+    "bags/pendulum_course",
 )
 
 
@@ -99,20 +102,20 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.timeout(900)
-def test_the_six_packages_are_wheels_with_launch_files_and_layouts(wheels: Path) -> None:
-    assert len(list(wheels.glob("*.whl"))) == 6
+def test_the_packages_are_wheels_with_launch_files_and_layouts(wheels: Path) -> None:
+    assert len(list(wheels.glob("*.whl"))) == len(FOLDERS)
     held = {name for wheel in wheels.glob("*.whl") for name in zipfile.ZipFile(wheel).namelist()}
     for ending in (
         "share/pendulum_lqr/launch/bringup.launch.py",
         "share/pendulum_sim/rviz/pendulum.rviz",
         "share/pendulum_bags/config/plotjuggler_layout.xml",
-        "pendulum_bags/live/foxglove_layout.json",
-        "pendulum_bags/console/static/console.js",
+        "pendulum_console/live/foxglove_layout.json",
+        "pendulum_console/console/static/console.js",
         "pendulum_msgs_py/plants/presets/thesis.yaml",
     ):
         assert any(name.endswith(ending) for name in held), ending
     archives = list((wheels.parent / "archives").glob("*.tar.gz"))
-    assert len(archives) == 6
+    assert len(archives) == len(FOLDERS)
     for archive in archives:
         with tarfile.open(archive) as content:
             assert any(name.endswith("/package.xml") for name in content.getnames()), archive.name

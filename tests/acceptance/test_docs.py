@@ -18,7 +18,7 @@ from xml.etree import ElementTree
 import pytest
 import yaml
 
-from pendulum_bags.commands.foxglove_cli import LAYOUT
+from pendulum_console.commands.foxglove_cli import LAYOUT
 from pendulum_lqr.controller_interface.controller import CONTROLLERS, Row, make_controller
 from pendulum_lqr.linear.design import DesignError
 from pendulum_msgs_py.contract import names

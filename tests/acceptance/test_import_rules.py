@@ -21,6 +21,9 @@ FOLDERS = [
     "pendulum_hw_bridge",
     "bags/pendulum_rosbag",
     "bags/pendulum_bags",
+    "bags/pendulum_console",
+    "bags/pendulum_learning",
+    "bags/pendulum_course",
 ]
 
 OFFENCES = {

@@ -109,7 +109,7 @@ def test_a_wheel_names_every_library_that_its_modules_import_and_no_other(packag
     others = {"ros", "rviz", "test", "cuda"}
     named = set().union(*(names for extra, names in of_package(package).items() if extra not in others))
     of_others = {name for name in named if not name.startswith("pendulum-")}
-    through_ours = [{"gymnasium"}] if package == "pendulum_bags" else []
+    through_ours = [{"gymnasium"}] if package == "pendulum_learning" else []
     for_its_files = {"plotly"} if package == "pendulum_bags" else set()
     assert [names for names in used if not names & named] == through_ours
     assert of_others - set().union(*used) <= for_its_files
@@ -117,8 +117,10 @@ def test_a_wheel_names_every_library_that_its_modules_import_and_no_other(packag
 
 def test_the_first_layer_has_what_the_wheels_always_need_and_the_second_all_their_extras() -> None:
     first, extras, test = ({canonicalize_name(pin.name) for pin in pins(layer)} for layer in ("run", "extras", "test"))
-    layers = {"": first, "emulator": first, "test": first | test}
     for package in FOLDERS:
+        # What shows plants in a browser is optional as a whole.
+        needed = first | extras if package == "pendulum_console" else first
+        layers = {"": needed, "emulator": first, "test": first | test}
         for extra, names in of_package(package).items():
             if extra == "cuda":
                 # Libraries of some gigabytes, for computers with a GPU.
@@ -160,8 +162,8 @@ def test_other_programs_say_their_help_with_the_first_layer_alone(tmp_path: Path
 @pytest.mark.parametrize(
     ("command", "library", "extra"),
     [
-        ("pendulum_bags console", "uvicorn", "pendulum_bags[console]"),
-        ("pendulum_bags foxglove", "foxglove", "pendulum_bags[foxglove]"),
+        ("pendulum_console console", "uvicorn", "pendulum_console"),
+        ("pendulum_console foxglove", "foxglove", "pendulum_console[foxglove]"),
         ("pendulum_sim mujoco --ros-args -p model:=m.xml", "mujoco", "pendulum_sim[mujoco]"),
         (
             "pendulum_bags experiment lockstep --bag b --simulation gymnasium:Pendulum-v1",
@@ -213,7 +215,7 @@ def test_what_the_readme_and_the_report_of_make_experiment_point_at_runs_with_th
 def test_a_library_that_no_package_names_is_no_matter_of_extras() -> None:
     assert extra_of("numpy") == "pendulum_msgs_py"
     assert extra_of("rclpy.node") == "pendulum_msgs_py[ros]"
-    assert extra_of("fastapi.responses") == "pendulum_bags[console]"
+    assert extra_of("fastapi.responses") == "pendulum_console"
     assert how_to_install(ModuleNotFoundError("No module named 'nobody'", name="nobody")) == ""
     assert how_to_install(ImportError("numpy is broken")) == ""
 

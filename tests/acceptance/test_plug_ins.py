@@ -25,6 +25,9 @@ PACKAGES = (
     "pendulum_hw_bridge/pendulum_hw_bridge",
     "bags/pendulum_rosbag/pendulum_rosbag",
     "bags/pendulum_bags/pendulum_bags",
+    "bags/pendulum_console/pendulum_console",
+    "bags/pendulum_learning/pendulum_learning",
+    "bags/pendulum_course/pendulum_course",
 )
 
 FILES = {

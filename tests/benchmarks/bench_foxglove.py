@@ -34,7 +34,7 @@ def rows() -> Iterator[Row]:
         with socket.socket() as probe:
             probe.bind(("127.0.0.1", 0))
             port = probe.getsockname()[1]
-        server = running.group.start("pendulum_bags", "foxglove", "--port", str(port), env=running.environment)
+        server = running.group.start("pendulum_console", "foxglove", "--port", str(port), env=running.environment)
         for plant in PLANTS:
             server.wait_for_output(rf"^plant {plant}$", 60)
         process = psutil.Process(server.pid)

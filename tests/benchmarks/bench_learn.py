@@ -24,10 +24,10 @@ from typing import Any
 import numpy as np
 
 from pendulum_bags.experiments.joint_run import stand_in_for
-from pendulum_bags.learning.evaluation import Trial, is_up, measured_success, run_trial, trials_of
-from pendulum_bags.learning.task import VARIED, SwingUpTask
 from pendulum_bags.studies.leaderboard import evaluate
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
+from pendulum_learning.evaluation import Trial, is_up, measured_success, run_trial, trials_of
+from pendulum_learning.task import VARIED, SwingUpTask
 from pendulum_lqr.controllers.policy import START_TIME, LearnedPolicy
 from pendulum_lqr.policies.policy import Policy
 from pendulum_lqr.policies.policy_file import load_policy
@@ -257,7 +257,7 @@ def _machine(folder: Path) -> Iterator[Row]:
 
 def _train(*arguments: str, out: Path) -> tuple[dict[str, Any], float, float]:
     """Train by the command line; return what it says, wall time and CPU time [s]."""
-    command = [sys.executable, "-m", "pendulum_bags", "train", *arguments, "--json", "--out", str(out)]
+    command = [sys.executable, "-m", "pendulum_learning", "train", *arguments, "--json", "--out", str(out)]
     before, began = os.times(), time.monotonic()
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     wall, after = time.monotonic() - began, os.times()

@@ -124,7 +124,7 @@ def start_console(group: ProcessGroup, environment: dict[str, str], runs: Path) 
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    console = group.start("pendulum_bags", "console", "--port", str(port), "--runs", runs, env=environment)
+    console = group.start("pendulum_console", "console", "--port", str(port), "--runs", runs, env=environment)
     console.wait_for_output(r"console at http://localhost", _START_TIMEOUT)
     return console, f"localhost:{port}"
 

@@ -9,10 +9,10 @@ from xml.etree import ElementTree
 
 import pytest
 
-from pendulum_bags.console.console_node import Hub
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.processes import ProcessSet, ros_environment, start_recorder
+from pendulum_console.console.console_node import Hub
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.programs import graph

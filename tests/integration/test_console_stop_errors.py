@@ -15,7 +15,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
-from pendulum_bags.console.console_node import Hub
+from pendulum_console.console.console_node import Hub
 from pendulum_msgs_py.contract.cdr import encode_joint_state
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.ros import qos

@@ -17,7 +17,6 @@ import numpy as np
 import psutil
 import pytest
 
-from pendulum_bags.commands.course_cli import main as course_main
 from pendulum_bags.commands.experiment_cli import main
 from pendulum_bags.experiments import lockstep
 from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
@@ -27,6 +26,7 @@ from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
 from pendulum_bags.verdict import Layer, read_layers
+from pendulum_course.course_cli import main as course_main
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_lqr.responses.measured_response import read_response
 from pendulum_msgs_py.errors import FaultError

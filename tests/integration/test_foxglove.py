@@ -13,7 +13,7 @@ from contextlib import closing
 import psutil
 import pytest
 
-from pendulum_bags.live.handshake import as_asked, parse, refusal, to_server
+from pendulum_console.live.handshake import as_asked, parse, refusal, to_server
 from pendulum_msgs_py.errors import FaultError
 from pendulum_testing.fixtures import wait_for
 from pendulum_testing.plant_peer import PlantPeer
@@ -83,7 +83,7 @@ def start(processes: ProcessGroup, *options: str) -> tuple[RunningProgram, int]:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    program = processes.start("pendulum_bags", "foxglove", "--port", str(port), *options)
+    program = processes.start("pendulum_console", "foxglove", "--port", str(port), *options)
     program.wait_for_output(r"^foxglove at ws://", 60)
     return program, port
 
@@ -178,7 +178,7 @@ def test_who_is_refused_hears_why_and_so_does_the_terminal(processes: ProcessGro
     # Nothing runs on this domain, which is said, and is no reason to end.
     program.wait_for_output(rf"^no plant on ROS domain {domain_id}; start one", 20)
 
-    command = [sys.executable, "-m", "pendulum_bags", "foxglove", "--port", str(port)]
+    command = [sys.executable, "-m", "pendulum_console", "foxglove", "--port", str(port)]
     second = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert second.returncode == 2
     said = f"port is {port}, which another program listens on; expected a free one: --port PORT"

@@ -37,7 +37,7 @@ It hears a hangup also under ``nohup``.
 _PROGRAM = """
 import contextlib, os, subprocess, sys, threading, time
 from pathlib import Path
-from pendulum_bags.console.jobs import Jobs
+from pendulum_console.console.jobs import Jobs
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.processes import ProcessSet, start_recorder
 from pendulum_bags.recordings.bridge_programs import run_bridge_program

@@ -17,15 +17,11 @@ EXECUTABLES: dict[str, str] = {
     "report": "pendulum_bags.commands.report_cli:main",
     "export": "pendulum_rosbag.reader.export_cli:main",
     "play": "pendulum_rosbag.player.player_node:main",
-    "console": "pendulum_bags.commands.console_cli:main",
-    "foxglove": "pendulum_bags.commands.foxglove_cli:main",
     "info": "pendulum_rosbag.reader.info_cli:main",
     "repair": "pendulum_rosbag.repair.repair_cli:main",
 }
 
 COMMANDS: dict[str, str] = {
-    "course": "pendulum_bags.commands.course_cli:main",
-    "train": "pendulum_bags.commands.train_cli:main",
     "convert": "pendulum_rosbag.convert.convert_cli:convert_main",
     "merge": "pendulum_rosbag.convert.convert_cli:merge_main",
     "cut": "pendulum_rosbag.convert.convert_cli:cut_main",

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.programs import completion
-from pendulum_msgs_py.programs.extras import how_to_install
+from pendulum_msgs_py.programs.extras import PACKAGES, how_to_install
 from pendulum_msgs_py.programs.interrupts import keep_interrupts
 from pendulum_msgs_py.programs.typed_commands import as_typed
 
@@ -32,6 +32,7 @@ __all__ = [
     "answer_of_dispatcher",
     "cli_main",
     "is_exhaustion",
+    "is_installed",
     "print_completion",
     "print_text",
     "report_error",
@@ -65,9 +66,24 @@ def run_package(package: str, argv: Sequence[str] | None = None) -> int:
         arguments,
         table,
         usage=lambda: _usage(package, table),
-        unknown=lambda name: f"{package} has no executable {name!r}; expected one of {', '.join(sorted(table))}",
+        unknown=lambda name: (
+            f"{package} has no executable {name!r}; {_home_of(name)}expected one of {', '.join(sorted(table))}"
+        ),
     )
     return run_program(table[arguments[0]], arguments[1:]) if code is None else code
+
+
+def is_installed(package: str) -> bool:
+    """Return whether a package with a table of programs is there, without importing its modules."""
+    return (
+        importlib.util.find_spec(package) is not None and importlib.util.find_spec(f"{package}.executables") is not None
+    )
+
+
+def _home_of(program: str) -> str:
+    """Return where a program that a package does not have is found, for its error message; empty for an unknown one."""
+    homes = [package for package in PACKAGES if is_installed(package) and program in tables_of(package)]
+    return f"python -m {homes[-1]} {program} runs it; " if homes else ""
 
 
 def answer_of_dispatcher(

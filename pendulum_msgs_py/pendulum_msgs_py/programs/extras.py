@@ -5,10 +5,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-__all__ = ["extra_of", "how_to_install"]
+__all__ = ["PACKAGES", "extra_of", "how_to_install"]
 
-_PACKAGES = (
+PACKAGES = (
     "pendulum_msgs_py", "pendulum_rosbag", "pendulum_sim", "pendulum_lqr", "pendulum_hw_bridge", "pendulum_bags",
+    "pendulum_console", "pendulum_learning", "pendulum_course",
 )  # fmt: skip
 _DISTRIBUTIONS = {"foxglove": "foxglove-sdk", "hebi": "hebi-py", "PIL": "pillow", "dask": "distributed"}
 """Distributions whose name differs from the module's."""
@@ -16,13 +17,13 @@ _REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)[^;]*(?:;.*extra\s*==\s*[\"']([\w-
 
 
 def extra_of(module: str) -> str:
-    """Return the extra that installs a module, as ``pendulum_bags[console]``, its package, or an empty string."""
+    """Return the extra that installs a module, as ``pendulum_console``, its package, or an empty string."""
     # Imported late: few programs lack a library.
     from importlib.metadata import PackageNotFoundError, requires
 
     top = module.partition(".")[0]
     wanted = {_plain(name) for name in (_DISTRIBUTIONS.get(top, top), f"ros-{top}", f"ros-jazzy-{top}")}
-    for package in _PACKAGES:
+    for package in PACKAGES:
         try:
             entries = requires(package) or []
         except PackageNotFoundError:
@@ -37,7 +38,7 @@ def extra_of(module: str) -> str:
 def how_to_install(error: ImportError) -> str:
     """Return a sentence on how to install the missing library, or where an own module moved to; empty for others."""
     module = error.name if isinstance(error, ModuleNotFoundError) else None
-    if module and (package := module.partition(".")[0]) in _PACKAGES and (place := _place_of(package)) is not None:
+    if module and (package := module.partition(".")[0]) in PACKAGES and (place := _place_of(package)) is not None:
         # The import uses a module's name of an earlier version.
         now = sorted(
             f"{package}.{path.parent.name}.{path.stem}" for path in place.glob(f"*/{module.split('.')[-1]}.py")

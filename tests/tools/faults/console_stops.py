@@ -114,7 +114,7 @@ class StopRig:
     def start_console(self) -> RunningProgram:
         """Start the console on its port."""
         runs = self._folder / "runs"
-        console = self._processes.start("pendulum_bags", "console", "--port", str(self.port), "--runs", runs)
+        console = self._processes.start("pendulum_console", "console", "--port", str(self.port), "--runs", runs)
         console.wait_for_output(r"console at http://localhost", 60)
         return console
 

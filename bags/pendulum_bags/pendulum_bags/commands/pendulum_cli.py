@@ -5,7 +5,15 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from pendulum_msgs_py.programs.executables import answer_of_dispatcher, run_program, summary, tables_of
+from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.programs.executables import (
+    answer_of_dispatcher,
+    is_installed,
+    report_error,
+    run_program,
+    summary,
+    tables_of,
+)
 
 __all__ = ["SECTIONS", "main"]
 
@@ -24,12 +32,12 @@ SECTIONS: dict[str, dict[str, str]] = {
         "replay": "pendulum_bags replay",
         "design": "pendulum_lqr design",
         "swing_up": "pendulum_lqr swing_up",
-        "train": "pendulum_bags train",
+        "train": "pendulum_learning train",
         "convert_policy": "pendulum_lqr convert_policy",
     },
     "See, move and stop what runs": {
-        "console": "pendulum_bags console",
-        "foxglove": "pendulum_bags foxglove",
+        "console": "pendulum_console console",
+        "foxglove": "pendulum_console foxglove",
         "move": "pendulum_bags move",
         "viewer": "pendulum_sim viewer",
         "phase_plot": "pendulum_sim phase_plot",
@@ -70,7 +78,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "cut": "pendulum_bags cut",
         "filter": "pendulum_bags filter",
     },
-    "Teach": {"course": "pendulum_bags course"},
+    "Teach": {"course": "pendulum_course course"},
 }
 """Heading -> command -> package and program."""
 _EXAMPLES = (
@@ -102,6 +110,12 @@ def main(argv: Sequence[str] | None = None) -> int:
         return code
     name, *rest = arguments
     package, program = commands[name].split()
+    if not is_installed(package):
+        return report_error(
+            ParameterError(
+                f"{package} is not installed, which {name} is in; install it: python -m pip install {package}"
+            )
+        )
     return run_program(tables_of(package)[program], rest, called_as=f"pendulum {name}")
 
 
@@ -112,6 +126,8 @@ def _help() -> str:
         lines += ["", heading]
         for name, target in section.items():
             package, program = target.split()
+            if not is_installed(package):
+                continue
             lines.append(f"  {name:<{width}}  {summary(program, tables_of(package)[program])}".rstrip())
     lines += ["", "Examples:", *(f"  {example}" for example in _EXAMPLES)]
     lines += ["", "pendulum COMMAND --help has more of each. Completion with the Tab key, in bash or zsh:"]

@@ -1,1 +1,0 @@
-"""A course in six exercises: hidden plants from a seed, and checks of the results."""

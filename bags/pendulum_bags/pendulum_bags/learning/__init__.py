@@ -1,1 +1,0 @@
-"""Training of policies for a plant, with what makes them transfer to a machine."""

@@ -1,0 +1,3 @@
+"""Training of policies for a plant, with what makes them transfer to a machine."""
+
+__version__ = "0.1.0"

@@ -1,0 +1,5 @@
+"""The programs of this package: name and entry point, read by ``setup.py`` and ``python -m``."""
+
+__all__ = ["EXECUTABLES"]
+
+EXECUTABLES: dict[str, str] = {"train": "pendulum_learning.train_cli:main"}
