@@ -15,7 +15,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 
-_PLANTS = ("thesis", "cart_pole", "acrobot", "furuta")
+_PLANTS = ("thesis", "cart_pole", "acrobot", "furuta", "reaction_wheel", "triple_pendulum")
 
 
 def _plant(name: str) -> PlantParameters:

@@ -16,7 +16,7 @@ from pendulum_sim.batches.compiling import compile_tree
 from pendulum_sim.exports.model_files import main, mjcf, urdf
 
 mujoco = pytest.importorskip("mujoco")
-_SMOOTH = ("cart_pole", "double_pendulum", "acrobot", "pendubot", "furuta")
+_SMOOTH = ("cart_pole", "double_pendulum", "acrobot", "pendubot", "furuta", "reaction_wheel", "triple_pendulum")
 
 
 @pytest.mark.parametrize("name", _SMOOTH)
@@ -85,7 +85,7 @@ def test_a_link_that_no_body_can_have_is_simulated_but_not_exported() -> None:
         mjcf(plant)
 
 
-@pytest.mark.parametrize("name", ["thesis", "cart_pole", "acrobot", "furuta"])
+@pytest.mark.parametrize("name", ["thesis", "cart_pole", "acrobot", "furuta", "triple_pendulum"])
 def test_compiled_with_numba_in_any_arithmetic_the_acceleration_is_that_of_python(name: str) -> None:
     plant = load_mechanism(name)
     forward, p, n = plant.mechanism.forward, plant.packed, len(plant.joints)

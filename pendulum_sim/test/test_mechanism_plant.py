@@ -15,7 +15,7 @@ from pendulum_sim.stepping.mechanism_plant import MechanismPlant
 from pendulum_sim.stepping.plant import RigidPlant
 from pendulum_testing.joint_plants import without_friction
 
-_PLANTS = ("cart_pole", "acrobot", "furuta")
+_PLANTS = ("cart_pole", "acrobot", "furuta", "reaction_wheel", "triple_pendulum")
 
 
 def _free(name: str):
@@ -28,10 +28,11 @@ def test_energy_is_conserved_without_friction_to_the_order_of_the_integrator(nam
     drifts = []
     for substeps in (1, 2):
         plant = MechanismPlant(_free(name), 2e-3, substeps=substeps)
-        plant.reset((0.1, 2.0), (0.5, -1.0))
+        n, still = len(plant.parameters.joints), (0.0,) * len(plant.parameters.effort_limits)
+        plant.reset((0.1, 2.0, -0.5)[:n], (0.5, -1.0, 2.0)[:n])
         before = plant.energy
         for _ in range(500):
-            plant.step((0.0,))
+            plant.step(still)
         drifts.append(abs(plant.energy - before) / abs(before))
     assert drifts[0] < 1e-4
     assert drifts[1] < drifts[0] / 8.0 or drifts[1] < 1e-13
@@ -42,15 +43,17 @@ def test_a_step_under_torque_is_that_of_an_adaptive_integrator(name: str) -> Non
     parameters = _free(name)
     n, limit = len(parameters.joints), parameters.effort_limits[0]
     plant = MechanismPlant(parameters, 1e-3)
-    plant.reset((0.2, -0.4), (0.3, 1.0))
+    q, v, push = (0.2, -0.4, 0.6)[:n], (0.3, 1.0, -0.7)[:n], (0.01 * limit, -0.02 * limit, 0.03 * limit)[:n]
+    effort = (0.3 * limit,) * len(parameters.effort_limits)
+    plant.reset(q, v)
     for _ in range(200):
-        state = plant.step((0.3 * limit,), (0.01 * limit, -0.02 * limit))
-    total = np.add(parameters.coordinates.spread((0.3 * limit,)), (0.01 * limit, -0.02 * limit))
+        state = plant.step(effort, push)
+    total = np.add(parameters.coordinates.spread(effort), push)
 
     def flow(_t: float, x: np.ndarray) -> list[float]:
         return [*x[n:], *parameters.acceleration(tuple(x[:n]), tuple(x[n:]), tuple(total))]
 
-    end = scipy.integrate.solve_ivp(flow, (0.0, 0.2), [0.2, -0.4, 0.3, 1.0], rtol=1e-11, atol=1e-12).y[:, -1]
+    end = scipy.integrate.solve_ivp(flow, (0.0, 0.2), [*q, *v], rtol=1e-11, atol=1e-12).y[:, -1]
     np.testing.assert_allclose([*state.position, *state.velocity], end, rtol=2e-5, atol=1e-6)
     assert state.time == pytest.approx(0.2)
 
@@ -76,18 +79,20 @@ def test_joints_within_their_friction_rest_to_the_last_bit() -> None:
     assert state.velocity == (0.0, 0.0)
 
 
-def test_a_joint_that_is_held_is_welded_while_the_other_swings() -> None:
-    # The elbow's friction is far above what the swinging shoulder can ask of it.
-    parameters = load_mechanism("acrobot").with_values(
-        {"elbow.coulomb_friction": 50.0, "shoulder.coulomb_friction": 0.0}
-    )
+@pytest.mark.parametrize(("name", "still"), [("acrobot", (0.5,)), ("triple_pendulum", (0.5, -0.4))])
+def test_joints_that_are_held_are_welded_while_another_swings(name: str, still: tuple[float, ...]) -> None:
+    # Their friction is far above what the swinging shoulder can ask of them.
+    held = load_mechanism(name).coordinates.names[1:]
+    stuck = {f"{joint}.coulomb_friction": 500.0 for joint in held}
+    parameters = load_mechanism(name).with_values({**stuck, "shoulder.coulomb_friction": 0.0})
     plant = MechanismPlant(parameters, 1e-3)
-    plant.reset((1.0, 0.5))
+    plant.reset((1.0, *still))
     before = plant.energy
     for _ in range(1000):
-        state = plant.step((0.0,))
-        assert state.position[1] == 0.5
-        assert state.velocity[1] == 0.0
+        state = plant.step((0.0,) * len(parameters.effort_limits))
+        assert state.position[1:] == still
+        assert state.velocity[1:] == (0.0,) * len(still)
+    assert abs(state.velocity[0]) + abs(state.position[0] - 1.0) > 0.1
     lost = parameters.joints[0].damping
     assert plant.energy <= before
     assert plant.energy == pytest.approx(before, abs=20.0 * lost)

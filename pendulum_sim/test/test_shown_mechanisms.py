@@ -43,7 +43,7 @@ def test_joints_are_where_the_links_of_the_picture_meet(name: str) -> None:
 @pytest.mark.parametrize("name", MECHANISM_PRESETS)
 def test_a_positive_angle_turns_from_right_to_up(name: str) -> None:
     plant = load_mechanism(name)
-    q, step = (0.3, -0.7), 1e-6
+    q, step = (0.3, -0.7, 1.1)[: len(plant.joints)], 1e-6
     for index, frame in enumerate(joint_frames(plant, q)):
         moved = joint_frames(plant, tuple(value + step * (k == index) for k, value in enumerate(q)))[index]
         arm = frame.tip - frame.origin

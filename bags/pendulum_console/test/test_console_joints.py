@@ -3,6 +3,7 @@
 import json
 import math
 
+import numpy as np
 import pytest
 
 from pendulum_console.console.joint_values import JointValues
@@ -25,7 +26,8 @@ def test_each_joint_has_its_own_values_and_what_upright_means_for_it() -> None:
     values.take_effort("command", _efforts(("elbow",), 2.5), 1.0)
     picture = values.picture(1.1)
     shoulder, elbow = picture["joints"]
-    assert [picture[whole] for whole in ("chain", "cart", "rotary")] == [True, False, False]
+    assert np.linalg.norm(np.diff(picture["points"], axis=0), axis=1) == pytest.approx([0.4, 0.6])
+    assert picture["points"][1] == pytest.approx([0.4 * math.sin(3.0), -0.4 * math.cos(3.0)])
     assert shoulder == {
         "name": "shoulder",
         "unit": "rad",
@@ -39,20 +41,28 @@ def test_each_joint_has_its_own_values_and_what_upright_means_for_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("joints", "unit", "goal", "whole"),
+    ("joints", "unit", "goal", "drawn"),
     [
-        (("pendulum_joint",), "rad", math.pi, ""),
-        (("cart", "pole"), "m", 0.0, "cart"),
-        (("arm", "pendulum"), "rad", 0.0, "rotary"),
-        (("hip", "knee", "ankle"), "rad", 0.0, ""),
+        (("pendulum_joint",), "rad", math.pi, 2),
+        (("cart", "pole"), "m", 0.0, 2),
+        (("arm", "pendulum"), "rad", 0.0, 3),
+        (("swing", "wheel"), "rad", math.pi, 3),
+        (("shoulder", "elbow", "wrist"), "rad", math.pi, 4),
+        (("hip", "knee", "ankle"), "rad", 0.0, 0),
     ],
 )
-def test_only_known_mechanisms_say_what_upright_is(joints: tuple[str, ...], unit: str, goal: float, whole: str) -> None:
+def test_only_known_mechanisms_are_drawn_and_say_what_upright_is(
+    joints: tuple[str, ...], unit: str, goal: float, drawn: int
+) -> None:
     values = JointValues()
     values.take_state(_state(joints, *(0.0 for _ in joints)))
     picture = values.picture(0.0)
     assert (picture["joints"][0]["unit"], picture["joints"][0]["goal"]) == (unit, goal)
-    assert [name for name in ("chain", "cart", "rotary") if picture[name]] == ([whole] if whole else [])
+    assert len(picture.get("points", ())) == drawn
+    assert bool(picture.get("slides")) == (unit == "m")
+    assert ("circle" in picture) == ("arm" in joints)
+    if drawn:
+        assert picture["points"][-1][1] < 0.0, "it hangs down"
 
 
 def test_an_effort_without_a_name_is_for_the_one_joint() -> None:

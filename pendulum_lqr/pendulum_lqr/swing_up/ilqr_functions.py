@@ -15,7 +15,7 @@ import numpy as np
 from pendulum_lqr.swing_up.small_matrices import keep_convex
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
-from pendulum_msgs_py.loops.trees import WITHIN
+from pendulum_msgs_py.loops.trees import WITHIN, tuple_loader
 from pendulum_msgs_py.mechanisms import Mechanism
 
 __all__ = ["cost_functions", "step_functions"]
@@ -28,17 +28,6 @@ _TINY = 2.0**-64
 """Imaginary step."""
 
 
-def _tuple_1(a: Any, i: int) -> Any:
-    return (a[i],)
-
-
-def _tuple_2(a: Any, i: int) -> Any:
-    return a[i], a[i + 1]
-
-
-_TUPLES = {1: _tuple_1, 2: _tuple_2}
-
-
 def step_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
     """Return compiled (advance, derive): the next node from z and u, and the derivatives of that step.
 
@@ -49,7 +38,7 @@ def step_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
     size = 2 * n + m
     where = np.array(driven)
     along = numba.njit(along_functions(n), **WITHIN)
-    pick = numba.njit(_TUPLES[n], **WITHIN)
+    pick = tuple_loader(n, 1)
     # Inlined: machine code without function arguments can be cached on disk.
     rk4 = numba.njit(_fresh(rk4_joints), forceinline=True, **WITHIN)
     forward = numba.njit(_fresh(mechanism.forward), error_model="numpy", **WITHIN)
@@ -116,7 +105,7 @@ def cost_functions(mechanism: Mechanism, driven: tuple[int, ...]) -> Any:
     n, m = len(mechanism.joints), len(driven)
     turns = np.array([joint.turns for joint in mechanism.joints])
     where = np.array(driven)
-    pick = numba.njit(_TUPLES[n], **WITHIN)
+    pick = tuple_loader(n, 1)
     potential = numba.njit(_fresh(mechanism.potential), error_model="numpy", **WITHIN)
     potential_c = numba.njit(in_arithmetic(mechanism.potential, cmath), error_model="numpy", **WITHIN)
 

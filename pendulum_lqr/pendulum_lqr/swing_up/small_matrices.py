@@ -82,9 +82,23 @@ def eliminate(work: Any, m: int) -> None:
 
 @numba.njit(error_model="numpy", **WITHIN)
 def keep_convex(M: Any, n: int) -> None:
-    """Replace the first n (1 or 2) rows and columns by the convex part of their symmetric part, in place."""
+    """Replace the first n rows and columns by the convex part of their symmetric part, in place.
+
+    Of three and more rows the diagonal is raised instead, by what makes it dominant if no less is known (Gershgorin).
+    """
     if n == 1:
         M[0, 0] = max(M[0, 0], 0.0)
+    elif n > 2:
+        lack = 0.0
+        for i in range(n):
+            rest = M[i, i]
+            for j in range(n):
+                if i != j:
+                    M[i, j] = M[j, i] = 0.5 * (M[i, j] + M[j, i])
+                    rest -= abs(M[i, j])
+            lack = max(lack, -rest)
+        for i in range(n):
+            M[i, i] += lack
     else:
         a, b, c = M[0, 0], 0.5 * (M[0, 1] + M[1, 0]), M[1, 1]
         middle, radius = 0.5 * (a + c), np.sqrt((0.5 * (a - c)) ** 2 + b * b)

@@ -56,6 +56,13 @@ def put_2(values: Any, index: int, value: Any) -> Any:
     return (value, values[1]) if index == 0 else (values[0], value)
 
 
+def put_3(values: Any, index: int, value: Any) -> Any:
+    """Return the values of three joints with one replaced."""
+    if index == 0:
+        return (value, values[1], values[2])
+    return (values[0], value, values[2]) if index == 1 else (values[0], values[1], value)
+
+
 def lag_1(torque: Any, command: Any, elapsed: float, constants: Any) -> Any:
     """Return the effort of one lagging actuator after some time."""
     return (actuator_torque(torque[0], command[0], elapsed, constants[0]),)
@@ -69,14 +76,23 @@ def lag_2(torque: Any, command: Any, elapsed: float, constants: Any) -> Any:
     )
 
 
-_PUT = {1: put_1, 2: put_2}
-_LAG_FUNCTIONS = {1: lag_1, 2: lag_2}
+def lag_3(torque: Any, command: Any, elapsed: float, constants: Any) -> Any:
+    """Return the efforts of three lagging actuators after some time."""
+    return (
+        actuator_torque(torque[0], command[0], elapsed, constants[0]),
+        actuator_torque(torque[1], command[1], elapsed, constants[1]),
+        actuator_torque(torque[2], command[2], elapsed, constants[2]),
+    )
+
+
+_PUT = {1: put_1, 2: put_2, 3: put_3}
+_LAG_FUNCTIONS = {1: lag_1, 2: lag_2, 3: lag_3}
 
 
 def joint_functions(count: int) -> tuple[Callable[..., Any], ...]:
-    """Return (along, put, lag) for 1 or 2 joints, written out for the compiler; else raise a ParameterError."""
+    """Return (along, put, lag) for 1 to 3 joints, written out for the compiler; else raise a ParameterError."""
     if count not in _PUT:
-        raise ParameterError(f"a mechanism of {count} joints is not stepped yet; expected 1 or 2")
+        raise ParameterError(f"a mechanism of {count} joints is not stepped yet; expected 1 to 3")
     return along_functions(count), _PUT[count], _LAG_FUNCTIONS[count]
 
 
@@ -95,18 +111,23 @@ def _constrained(
     tau = _loaded(put, v, torque, direction, table)
     a = forward(q, v, tau, p)
     count = 0
-    last = 0
+    first = last = 0
     for i in range(len(a)):
         if held[i] > 0.0:
+            first = last if count else i
             count += 1
             last = i
     if count == len(a):
         return along(a, -1.0, a)
-    if count == 1:
+    if count > 0:
         # The acceleration is affine in the effort: a second point gives the holding effort.
         more = forward(q, v, put(tau, last, tau[last] + 1.0), p)
         column = along(more, -1.0, a)
+        other = along(forward(q, v, put(tau, first, tau[first] + 1.0), p), -1.0, a) if count == 2 else column
         a = put(along(a, -a[last] / column[last], column), last, 0.0)
+        if count == 2:
+            other = along(other, -other[last] / column[last], column)
+            a = put(put(along(a, -a[first] / other[first], other), first, 0.0), last, 0.0)
     return a
 
 

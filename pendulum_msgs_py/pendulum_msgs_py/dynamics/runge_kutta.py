@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-__all__ = ["along_1", "along_2", "along_functions", "rk4_joints"]
+__all__ = ["along_1", "along_2", "along_3", "along_functions", "rk4_joints"]
 
 
 def along_1(q: Any, h: Any, v: Any) -> Any:
@@ -18,9 +18,14 @@ def along_2(q: Any, h: Any, v: Any) -> Any:
     return q[0] + h * v[0], q[1] + h * v[1]
 
 
+def along_3(q: Any, h: Any, v: Any) -> Any:
+    """Return q + h v, of three joints."""
+    return q[0] + h * v[0], q[1] + h * v[1], q[2] + h * v[2]
+
+
 def along_functions(count: int) -> Callable[..., Any]:
     """Return the function for this number of joints."""
-    return {1: along_1, 2: along_2}[count]
+    return {1: along_1, 2: along_2, 3: along_3}[count]
 
 
 def rk4_joints(

@@ -96,4 +96,5 @@ FURUTA = Mechanism(
     bodies=bodies,
     weights=((1.0, 10.0, 0.1, 0.1), 100.0),
     source="B. S. Cazzolato and Z. Prime, On the dynamics of the Furuta pendulum, J. Control Sci. Eng., 2011, eq. 33.",
+    in_space=True,
 )

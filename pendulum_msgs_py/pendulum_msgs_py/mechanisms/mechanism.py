@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -14,6 +15,8 @@ __all__ = ["STANDARD_GRAVITY", "Body", "Mechanism", "Point", "Rotor", "gravity_s
 STANDARD_GRAVITY = 9.81
 """Default of the acceleration of gravity [m/s^2]."""
 
+_TILT = math.radians(25.0)
+"""Elevation of the view of a spatial mechanism [rad]."""
 Point = tuple[float, float, float]
 """x to the right, y away from the viewer, z up [m]."""
 
@@ -65,9 +68,9 @@ def _no_rotors(_p: Any) -> tuple[Rotor, ...]:
 class Mechanism:
     """Equations and joints, without numbers.
 
-    The functions take tuples, use ``+ - * /``, ``math.sin`` and ``math.cos`` alone, and have no branches: they run with
-    floats, compiled by numba, and by :func:`~pendulum_msgs_py.dynamics.arithmetic.in_arithmetic` with complex numbers,
-    arrays and symbols. ``p`` holds the values of ``parameters`` in order, then the viscous damping of each joint.
+    The functions take tuples, use ``+ - * /``, ``math.sin`` and ``math.cos`` alone, and have no branches or calls: they
+    run with floats, compiled by numba, and by :func:`~pendulum_msgs_py.dynamics.arithmetic.in_arithmetic` with complex
+    numbers, arrays and symbols. ``p`` holds the values of ``parameters`` in order, then each joint's viscous damping.
 
     Attributes:
         name: Name in plant files (``model:``).
@@ -83,6 +86,7 @@ class Mechanism:
         weights: Default diagonal of Q (deviations, then velocities) and of R.
         source: Publication of the equations.
         rotors: ``rotors(p)``, unless each motor's inertia is part of its link's.
+        in_space: Whether it leaves the plane of x and z, so that pictures show it from slightly above.
     """
 
     name: str
@@ -97,6 +101,7 @@ class Mechanism:
     weights: tuple[tuple[float, ...], float]
     source: str
     rotors: Callable[[Any], tuple[Rotor, ...]] = _no_rotors
+    in_space: bool = False
 
     def __hash__(self) -> int:
         return hash(self.name)  # quick: mechanisms are looked up for each plant
@@ -106,3 +111,8 @@ class Mechanism:
         """Names of the entries of ``p``; the damping is ``JOINT.damping``, of a single joint ``damping``."""
         damping = [f"{joint.name}.damping" for joint in self.joints] if len(self.joints) > 1 else ["damping"]
         return (*(spec.name for spec in self.parameters), *damping)
+
+    def seen(self, point: Point) -> tuple[float, float]:
+        """Return a point's place in a picture, to the right and up [m]; in space it is seen from slightly above."""
+        x, y, z = point
+        return (x, z * math.cos(_TILT) + y * math.sin(_TILT)) if self.in_space else (x, z)

@@ -12,16 +12,14 @@ from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract.angles import from_upright
 from pendulum_msgs_py.contract.joints import Joint, Vector
-from pendulum_msgs_py.mechanisms.mechanism import Mechanism, Point
+from pendulum_msgs_py.mechanisms.mechanism import Point
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.pictures.canvas import BACKGROUND, BOB, DISTURBANCE, GREY, INK, LINK, TORQUE, Colour, Picture
 from pendulum_sim.pictures.joint_frames import JointFrame, full_effort, joint_frames
 
-__all__ = ["PlantPicture", "seen_from_the_side"]
+__all__ = ["PlantPicture"]
 
 _LINKS = (LINK, BOB)
-_TILT = math.radians(25.0)
-"""Elevation of the view of a spatial plant [rad]."""
 _LINES = 20, 26
 """Lines of text in a picture of one joint, and of several."""
 _RAIL = 10.0
@@ -36,7 +34,7 @@ class PlantPicture(Picture):
         self.parameters = parameters
         self._joints = parameters.mechanism.joints
         self._slides = self._joints[0].unit == "m"
-        self._in_space = parameters.mechanism.name == "furuta"
+        self._in_space = parameters.mechanism.in_space
         still = (0.0,) * len(self._joints)
         points = parameters.mechanism.chain(still, parameters.packed)
         reach = sum(math.dist(first, second) for first, second in pairwise(points))
@@ -107,7 +105,8 @@ class PlantPicture(Picture):
 
     def _draw_circle(self, pixel: Any) -> None:
         """Draw the circle of an arm's end, and its position 0."""
-        arm = self.parameters.value("arm_length")
+        start, end, *_ = self.parameters.mechanism.chain((0.0,) * len(self._joints), self.parameters.packed)
+        arm = math.dist(start, end)
         ring = [
             pixel((arm * math.cos(turn), arm * math.sin(turn), 0.0)) for turn in np.linspace(0.0, 2.0 * math.pi, 73)
         ]
@@ -194,11 +193,5 @@ class PlantPicture(Picture):
         return rows
 
     def _pixel(self, point: Any) -> NDArray[np.float64]:
-        x, height = seen_from_the_side(self.parameters.mechanism, (point[0], point[1], point[2]))
+        x, height = self.parameters.mechanism.seen((point[0], point[1], point[2]))
         return self._origin + self._scale * np.array([x, -height])
-
-
-def seen_from_the_side(mechanism: Mechanism, point: Point) -> tuple[float, float]:
-    """Return a point's place in a picture, to the right and up [m]; a spatial plant is seen from slightly above."""
-    x, y, z = point
-    return (x, z * math.cos(_TILT) + y * math.sin(_TILT)) if mechanism.name == "furuta" else (x, z)

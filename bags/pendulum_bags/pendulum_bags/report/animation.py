@@ -13,7 +13,6 @@ from pendulum_bags.report.data import ReportData
 from pendulum_bags.runs.series import uniform_times
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
-from pendulum_sim.pictures.plant_picture import seen_from_the_side
 
 __all__ = ["animation_of", "joint_animation"]
 
@@ -84,9 +83,7 @@ def joint_animation(comparisons: Mapping[str, Comparison], plant: str) -> dict[s
 def _chains(parameters: PlantParameters, positions: Array) -> Array:
     """Return where the ends of all links are, to the right and up, shape (frames, points, 2) [m]."""
     mechanism, packed = parameters.mechanism, parameters.packed
-    return np.array(
-        [[seen_from_the_side(mechanism, point) for point in mechanism.chain(tuple(q), packed)] for q in positions]
-    )
+    return np.array([[mechanism.seen(point) for point in mechanism.chain(tuple(q), packed)] for q in positions])
 
 
 def _enlarged(largest: float) -> float:

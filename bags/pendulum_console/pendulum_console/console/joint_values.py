@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import isfinite
+from math import dist, isfinite
 from typing import Any
 
 from pendulum_msgs_py.contract.cdr import JointStateFields
@@ -13,9 +13,7 @@ __all__ = ["JointValues"]
 
 _FRESH = 0.3
 """Age at which a torque counts as ended [s]; plants accept none older than 0.05 s."""
-_CHAIN = MECHANISMS["double_pendulum"]
-_CART = MECHANISMS["cart_pole"]
-_ROTARY = MECHANISMS["furuta"]
+_KNOWN = {tuple(joint.name for joint in mechanism.joints): mechanism for mechanism in MECHANISMS.values()}
 
 
 class JointValues:
@@ -56,12 +54,27 @@ class JointValues:
             # JSON has no infinities or NaN: the page could read nothing more, of any plant.
             values = {key: value for key, value in {**self._states[joint.name], **efforts}.items() if isfinite(value)}
             joints.append({"name": joint.name, "unit": joint.unit, "goal": joint.goal, **values})
-        # Drawn as a whole: links hanging on each other, a pole on a cart, a pendulum at the end of an arm.
-        whole = {"chain": _CHAIN, "cart": _CART, "rotary": _ROTARY}
-        return {"joints": joints, **{name: self._joints == plant.joints for name, plant in whole.items()}}
+        return {"joints": joints, **self._drawn()}
+
+    def _drawn(self) -> dict[str, Any]:
+        """Return the chain to draw, to the right and up, of a mechanism with its default sizes and a reach of 1."""
+        mechanism = _KNOWN.get(tuple(joint.name for joint in self._joints))
+        position = tuple(self._states[joint.name]["theta"] for joint in self._joints)
+        if mechanism is None or not all(map(isfinite, position)):
+            return {}
+        p = (*(spec.default for spec in mechanism.parameters), *(0.0 for _ in mechanism.joints))
+        still = mechanism.chain((0.0,) * len(position), p)
+        scale = 1.0 / sum(map(dist, still, still[1:]))
+        drawn = [[scale * value for value in mechanism.seen(point)] for point in mechanism.chain(position, p)]
+        # The arm of a spatial mechanism turns in a circle.
+        circle = [scale * value for value in mechanism.seen((dist(*still[:2]),) * 2 + (0.0,))]
+        return {
+            "points": drawn,
+            "slides": self._joints[0].unit == "m",
+            **({"circle": circle} if mechanism.in_space else {}),
+        }
 
 
 def _joints(names: tuple[str, ...]) -> tuple[Joint, ...]:
     """Return the joints of the mechanism with these names, or hinges from 0 if none is known."""
-    known = {tuple(joint.name for joint in one.joints): one.joints for one in MECHANISMS.values()}
-    return known.get(names) or tuple(Joint(name) for name in names)
+    return _KNOWN[names].joints if names in _KNOWN else tuple(Joint(name) for name in names)

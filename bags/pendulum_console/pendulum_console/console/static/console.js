@@ -295,18 +295,6 @@
   window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { inks = {}; tape.stale = true; });
   const ink = (name) => (inks[name] ||= getComputedStyle(document.documentElement).getPropertyValue(name));
 
-  // A rotary pendulum is looked at from a little above: its arm turns about the vertical, its pendulum swings across the
-  // arm, upwards to where the arm goes when it turns forward (counter-clockwise from above).
-  const TILT = 25 * Math.PI / 180, ARM = 0.6, ROD = 0.8;
-  function inSpace(x, y, length) {
-    return ([px, py, pz]) => [x + length * px, y - length * (py * Math.sin(TILT) + pz * Math.cos(TILT))];
-  }
-  function rotaryPoints(project, arm, rod) {
-    const end = [ARM * Math.cos(arm), ARM * Math.sin(arm), 0], swing = ROD * Math.sin(rod);
-    const tip = [end[0] - swing * Math.sin(arm), end[1] + swing * Math.cos(arm), -ROD * Math.cos(rod)];
-    return [[0, 0, 0], end, tip].map(project);
-  }
-
   function drawPendulum(names) {
     const place = context("pendulum");
     if (!place) return;
@@ -319,44 +307,37 @@
     c.setLineDash([]);
     names.forEach((name, index) => {
       const plant = state.plants[name];
-      // What slides has no angle to draw, but for a cart with its pole; its position is in the lines.
-      if (!plant || plant.theta === undefined || (plant.unit === "m" && !plant.cart)) return;
+      // The server knows the mechanism; joints of no known one have nothing to draw, their positions are in the lines.
+      if (!plant?.points) return;
       const colour = COLOURS[index % COLOURS.length];
-      // One link, or links that hang on each other, as long together as the one.
-      const project = inSpace(x, y, length);
-      const links = plant.chain ? plant.joints.map((joint) => joint.theta) : [plant.cart ? plant.joints[1].theta : plant.theta];
-      // A metre of the rail is as long as the pole, and the rail as long as the picture is wide.
-      const foot = plant.cart ? Math.max(30, Math.min(width - 30, x + length * plant.joints[0].theta)) : x;
-      const points = plant.rotary ? rotaryPoints(project, plant.joints[0].theta, plant.joints[1].theta) : [[foot, y]];
-      if (!plant.rotary) links.reduce((angle, turn) => {
-        const at = points[points.length - 1], all = angle + turn;
-        points.push([at[0] + length / links.length * Math.sin(all), at[1] + length / links.length * Math.cos(all)]);
-        return all;
-      }, 0);
+      // A cart beyond the picture is drawn at its edge, with its pole.
+      const foot = plant.slides ? Math.max(30 - x, Math.min(width - 30 - x, length * plant.points[0][0])) : 0;
+      const shift = plant.slides ? foot - length * plant.points[0][0] : 0;
+      const points = plant.points.map(([right, up]) => [x + shift + length * right, y - length * up]);
       const [bx, by] = points[points.length - 1];
       const stale = serverTime() - plant.moved > 0.5;
       c.globalAlpha = stale ? 0.3 : 0.85;
       c.setLineDash(stale ? [5, 5] : []);
       c.strokeStyle = c.fillStyle = colour;
       c.lineWidth = 7 - 3 * index;
-      if (plant.cart) {
-        c.fillRect(foot - 26 + 3 * index, y - 9 + 2 * index, 52 - 6 * index, 18 - 4 * index);
+      if (plant.slides) {
+        c.fillRect(x + foot - 26 + 3 * index, y - 9 + 2 * index, 52 - 6 * index, 18 - 4 * index);
         c.lineWidth = 1;
         c.beginPath(); c.moveTo(0, y + 12); c.lineTo(width, y + 12); c.stroke();
         c.lineWidth = 7 - 3 * index;
       }
-      if (plant.rotary) {
+      if (plant.circle) {
         c.lineWidth = 1;
-        c.beginPath(); c.ellipse(x, y, ARM * length, ARM * length * Math.sin(TILT), 0, 0, 2 * Math.PI); c.stroke();
+        c.beginPath(); c.ellipse(x, y, length * plant.circle[0], length * plant.circle[1], 0, 0, 2 * Math.PI); c.stroke();
         c.lineWidth = 7 - 3 * index;
       }
-      c.beginPath(); c.moveTo(foot, y); points.slice(1).forEach(([px, py]) => c.lineTo(px, py)); c.stroke();
+      c.beginPath(); c.moveTo(...points[0]); points.slice(1).forEach(([px, py]) => c.lineTo(px, py)); c.stroke();
       points.slice(1, -1).forEach(([px, py]) => { c.beginPath(); c.arc(px, py, 6, 0, 7); c.fill(); });
       c.beginPath(); c.arc(bx, by, 13 - 2 * index, 0, 7);
       if (index) { c.lineWidth = 3; c.stroke(); } else c.fill();
       // Torques as arcs about the axis: 13 N m are three quarters of a turn; applied outside, disturbance inside.
       [[plant.applied, 34 + 14 * index, colour], [plant.disturbance, 27 + 14 * index, ink("--faint")]].forEach(([effort, radius, stroke]) => {
-        if (!effort || plant.cart) return;
+        if (!effort || plant.slides) return;
         const turn = 1.5 * Math.PI * Math.max(-1, Math.min(1, effort / 13));
         c.strokeStyle = stroke; c.lineWidth = 4;
         c.beginPath(); c.arc(x, y, radius, -Math.PI / 2, -Math.PI / 2 - turn, turn > 0); c.stroke();
@@ -365,7 +346,7 @@
       c.setLineDash([]);
     });
     c.fillStyle = ink("--ink");
-    if (names.some((name) => !state.plants[name]?.cart)) { c.beginPath(); c.arc(x, y, 4, 0, 7); c.fill(); }
+    if (names.some((name) => !state.plants[name]?.slides)) { c.beginPath(); c.arc(x, y, 4, 0, 7); c.fill(); }
   }
 
   // The lines are on a tape, a ring of pixel columns: what is new is drawn at its end, and a picture copies the last SPAN
