@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -452,14 +453,69 @@ def test_recordings_of_real_labs_are_read_without_a_mapping(shared_data: Path) -
     arm = Reading(shared_data / "dynamicslab_multiarm" / "SinglePendulumDataForParameterEstimation.mat")
     assert len(arm.motion.joints) == 1
     assert any("tested: 0 is upright" in guess.how for guess in arm.guesses)
-    with pytest.raises(DataError, match=r"holds an object of MATLAB .*save its arrays instead"):
-        Reading(shared_data / "dynamicslab_multiarm" / "SinglePendulumArm_RawData_1.mat").columns  # noqa: B018
     qube = Reading(next((shared_data / "qube_upright").glob("*.csv")))
     theta, alpha = qube.motion.joints
     assert (theta.name, alpha.name) == ("theta", "alpha")
     assert np.median(alpha.position) == pytest.approx(np.pi, abs=0.05)  # balanced upright
     double = Reading(shared_data / "dfki_double_pendulum" / "c1_143339.csv")
     assert [joint.drive is not None for joint in double.motion.joints] == [True, True]
+
+
+@pytest.mark.parametrize("version", ["v7", "v7.3"])
+def test_objects_of_matlab_are_read(tmp_path: Path, version: str) -> None:
+    matio = pytest.importorskip("matio")
+    import pandas as pd
+    from matio.utils import MatlabOpaque
+
+    def timeseries(values: np.ndarray, times: dict[str, object]) -> MatlabOpaque:
+        info = MatlabOpaque({"Units": "milliseconds", **times}, "tsdata.timemetadata")
+        return MatlabOpaque(
+            {"Data_": values.reshape(1, 1, -1), "Time_": np.zeros((0, 0)), "TimeInfo": info}, "timeseries"
+        )
+
+    empty, count = np.zeros((0, 0)), RUN["t"].size
+    stated = {"Time_": 1e3 * RUN["t"][:, None], "Start_": empty, "Increment_": empty, "Length": float(count)}
+    equal = {"Time_": empty, "Start_": 0.0, "Increment_": 1e3 * DT, "Length": float(count)}
+    signals = np.empty((1, 2), object)
+    for index, (name, key) in enumerate((("theta", "position"), ("omega", "velocity"))):
+        held = {"Name": name, "Values": timeseries(RUN[key], stated if index else equal)}
+        signals[0, index] = MatlabOpaque(held, "Simulink.SimulationData.Signal")
+    storage = MatlabOpaque({"Elements": signals}, "Simulink.SimulationData.Storage.RamDatasetStorage")
+    table = pd.DataFrame({"tau": RUN["torque"]}, index=pd.to_timedelta(RUN["t"], unit="s"))
+    path = tmp_path / "run.mat"
+    content = {
+        "logsout": MatlabOpaque({"Storage": storage}, "Simulink.SimulationData.Dataset"),
+        "run": {"table": table, "gain": np.array([2.0])},
+    }
+    matio.save_to_mat(str(path), content, version=version)
+
+    columns = Reading(path).columns
+    for name, key in (("logsout.theta", "position"), ("logsout.omega", "velocity"), ("run.table.tau", "torque")):
+        np.testing.assert_allclose(columns.values(name), RUN[key])
+        np.testing.assert_allclose(columns.values(columns.columns[name].clock), RUN["t"], atol=1e-9)
+
+
+def test_objects_of_matlab_need_their_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    matio = pytest.importorskip("matio")
+    import pandas as pd
+
+    table = {"T": pd.DataFrame({"theta": RUN["position"]}, index=pd.to_timedelta(RUN["t"], unit="s"))}
+    for version in ("v7", "v7.3"):
+        matio.save_to_mat(str(tmp_path / f"{version}.mat"), table, version=version)
+    scipy.io.savemat(tmp_path / "struct.mat", {"theta": {"time": RUN["t"], "data": RUN["position"]}})
+    monkeypatch.setitem(sys.modules, "matio", None)
+    for version in ("v7", "v7.3"):
+        with pytest.raises(DataError, match=r"objects of MATLAB, .*pip install mat-io.*'data', theta.Data\)"):
+            Reading(tmp_path / f"{version}.mat").columns  # noqa: B018
+    # What that sentence has MATLAB make.
+    np.testing.assert_allclose(Reading(tmp_path / "struct.mat").motion.joints[0].position, RUN["position"])
+
+
+def test_a_log_of_simulink_from_a_real_lab_is_read(shared_data: Path) -> None:
+    pytest.importorskip("matio")
+    columns = Reading(shared_data / "dynamicslab_multiarm" / "SinglePendulumArm_RawData_1.mat").columns
+    assert list(columns.columns) == ["data.Time", "data.Add2:1", "data.Product1:1"]
+    assert np.median(np.diff(columns.values("data.Time"))) == pytest.approx(0.001)
 
 
 # -- compare -----------------------------------------------------------------------------------------------------

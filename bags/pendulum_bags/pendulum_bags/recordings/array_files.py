@@ -1,4 +1,4 @@
-"""Files of arrays: NumPy's, and MATLAB's of versions 5 and 7.3 with structs, timeseries exports and cells.
+"""Files of arrays: NumPy's, and MATLAB's of versions 5 and 7.3 with structs, cells, timeseries, tables and datasets.
 
 Names are paths as one would write them in MATLAB: ``data.theta.values``; ``x[0]`` is a row or column of an array of two
 dimensions. A cell or an array of structs with one entry for each run is one recording for each entry.
@@ -7,11 +7,13 @@ dimensions. A cell or an array of structs with one entry for each run is one rec
 from __future__ import annotations
 
 import math
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +28,17 @@ _PERIODS = frozenset({"dt", "ts", "delta_t", "sampletime", "sample_time", "sampl
 """Names of a single number that is a sampling period."""
 _RATES = frozenset({"fs", "rate", "sample_rate", "samplerate", "fps", "frequency"})
 _DEEPEST = 6
-_OPAQUE = "an object of MATLAB (such as a timeseries, a table or a Simulink dataset), which no open reader takes apart"
-_HOW = "save its arrays instead: t = ts.Time; x = ts.Data; save('run.mat', 't', 'x')"
+_NUMBERS = frozenset(
+    {"double", "single", "logical", *(f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64))}
+)
+"""Classes of MATLAB that are numbers."""
+_OPAQUE = "objects of MATLAB, which the library mat-io reads (CPython 3.11 to 3.13: python -m pip install mat-io)"
+_HOW = (
+    "or make structs of them in MATLAB: theta = struct('time', theta.Time, 'data', theta.Data) of a timeseries, "
+    "T = table2struct(T, 'ToScalar', true) of a table; then save('run.mat', 'theta', 'T')"
+)
+_SECONDS = {"nanoseconds": 1e-9, "microseconds": 1e-6, "milliseconds": 1e-3, "minutes": 60.0, "hours": 3600.0}
+"""Units of the time of a timeseries, other than seconds [s]."""
 
 
 def read_numpy(path: Path, part: int = 0) -> Columns:
@@ -118,13 +129,15 @@ def read_matlab(path: Path, part: int = 0) -> Columns:
             head = file.read(128)
     except OSError as error:
         raise DataError(f"{path} cannot be read: {error.strerror or error}") from error
-    is_hdf = head.startswith(b"\x89HDF") or b"MATLAB 7.3" in head[:64]
+    # A header of versions 5 and 7.3 has the place of its objects, the version and the order of bytes at its end.
+    has_header = head[126:] in {b"IM", b"MI"}
+    is_hdf = head.startswith(b"\x89HDF") or (has_header and b"\x02" in head[124:126])
+    has_objects = has_header and head[116:124].strip(b"\0 ") != b""
     found: list[Column] = []
     numbers: dict[str, float] = {}
     lists: dict[str, list[list[Column]]] = {}
     opaque: list[str] = []
-    walk = _hdf_variables if is_hdf else _variables
-    for name, node in walk(path, opaque):
+    for name, node in _hdf_variables(path) if is_hdf else _variables(path, has_objects):
         entries = _entries(node)
         if entries is None:
             _gather(name, node, found, numbers, opaque)
@@ -137,10 +150,10 @@ def read_matlab(path: Path, part: int = 0) -> Columns:
             lists[name] = parts
     kind = "MATLAB file"
     if not found and not lists and opaque:
-        raise DataError(f"{path} holds {_OPAQUE}: {', '.join(opaque)}; {_HOW}")
+        raise DataError(f"{path}: {', '.join(opaque)} holds {_OPAQUE}; {_HOW}")
     result = _columns(path, kind, found, numbers, lists, part)
     if opaque:
-        result.notes.append(f"left out, as {_OPAQUE}: {', '.join(opaque)}")
+        result.notes.append(f"left out: {', '.join(opaque)}, {_OPAQUE}; {_HOW}")
     return result
 
 
@@ -252,28 +265,32 @@ def _places(name: str) -> Iterator[str]:
 # -- version 5 ---------------------------------------------------------------------------------------------------
 
 
-def _variables(path: Path, opaque: list[str]) -> Iterator[tuple[str, _Node]]:
+def _variables(path: Path, has_objects: bool) -> Iterator[tuple[str, _Node]]:
     """Yield the variables of a file of version 5; arrays of numbers are read when they are asked for."""
     import scipy.io
 
-    try:
-        listed = scipy.io.whosmat(str(path))
-    except TypeError:
-        # An object has no name there: a file of objects alone, as Simulink logs its datasets.
-        opaque.append("data")
-        return
-    except (OSError, ValueError, NotImplementedError, KeyError, IndexError, MemoryError) as error:
-        raise DataError(f"{path} is no MATLAB file: {str(error).splitlines()[0]}") from error
+    library: Any = scipy.io
+    if has_objects:
+        try:
+            import matio
 
+            library = matio
+        except ImportError:
+            yield path.stem, _Node(opaque=True)
+            return
+    try:
+        listed = library.whosmat(str(path))
+    except Exception as error:  # both libraries raise what a damaged file makes them stumble over
+        raise DataError(f"{path} is no MATLAB file: {str(error).splitlines()[0]}") from error
+    if has_objects:
+        listed = [(name, *entry) for name, entry in listed.items()]
     for name, shape, kind in listed:
-        if kind in {"unknown", "opaque", "object", "function"}:
-            opaque.append(name)
-        elif kind in {"struct", "cell"}:
-            yield name, _node(_loaded(path, name, ...))
-        elif kind not in {"char", "sparse"}:
-            load = partial(_loaded, path, name)
+        load = partial(_loaded, path, name, has_objects)
+        if kind in _NUMBERS:
             # All columns of a table are taken from it once it is read; a vector is kept by what reads it.
             yield name, _Node(shape=shape, read=load if 1 in shape else _shared(load))
+        elif kind not in {"char", "sparse", "function", "function_handle", "string"}:
+            yield name, _node(load(...))
 
 
 def _shared(load: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -282,18 +299,34 @@ def _shared(load: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return lambda key: whole()[key]
 
 
-def _loaded(path: Path, name: str, key: Any) -> Any:
+def _loaded(path: Path, name: str, has_objects: bool, key: Any) -> Any:
     """Return what an index chooses of one variable."""
     import scipy.io
 
     try:
-        return scipy.io.loadmat(str(path), variable_names=[name], mat_dtype=True)[name][key]
-    except Exception as error:  # scipy raises what a damaged file makes it stumble over
+        if not has_objects:
+            return scipy.io.loadmat(str(path), variable_names=[name], mat_dtype=True)[name][key]
+        import matio
+        from matio.utils.matclass import MatConvertWarning, MatReadWarning
+
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", MatConvertWarning)  # of the formats in which times are displayed
+            warnings.simplefilter("error", MatReadWarning)
+            value = matio.load_from_mat(str(path), variable_names=[name])[name]
+        return value[key] if isinstance(value, np.ndarray) else value
+    except Exception as error:  # both libraries raise what a damaged file makes them stumble over
         raise DataError(f"{path}: variable {name!r} cannot be read: {type(error).__name__}: {error}") from error
 
 
 def _node(value: Any) -> _Node:
-    """Return a value of scipy's as a node."""
+    """Return a value of scipy's or of matio's as a node."""
+    if hasattr(value, "properties"):
+        return _object(value)
+    if hasattr(value, "columns"):
+        # A table, or a timetable, whose row times are the index.
+        times = np.asarray(value.index)
+        columns = {"Time": times} if times.dtype.kind in "mM" else {}
+        return _node_of(columns | {str(name): np.asarray(value[name]) for name in value.columns})
     if not isinstance(value, np.ndarray) or type(value).__name__ in {"MatlabOpaque", "MatlabFunction"}:
         return _Node(opaque=type(value).__name__ == "MatlabOpaque")
     if value.dtype.names:
@@ -301,15 +334,66 @@ def _node(value: Any) -> _Node:
         return _Node(fields=rows[0]) if len(rows) == 1 else _Node(entries=[partial(_Node, fields=row) for row in rows])
     if value.dtype == object:
         return _Node(entries=[partial(_node, entry) for entry in value.flat])
+    if value.dtype.kind in "mM" and value.size and np.datetime_data(value.dtype)[0] not in "YM":
+        start = value.flat[0] if value.dtype.kind == "M" else np.timedelta64(0, "s")
+        value = (value - start) / np.timedelta64(1, "s")
     if value.dtype.kind in "biuf":
         return _Node(shape=value.shape, read=value.__getitem__, by_rows=True)
     return _Node()
 
 
+def _object(value: Any) -> _Node:
+    """Return an object: a timeseries has ``Time`` and ``Data``, a dataset of Simulink its signals by name."""
+    held = _properties(value)
+    if not (str(value.classname).endswith(".Dataset") and "Storage" in held):
+        return _node_of(_timeseries(value) or held)
+    signals: dict[str, Any] = {}
+    for index, element in enumerate(np.reshape(_properties(held["Storage"])["Elements"], -1), start=1):
+        signal = _properties(element)
+        name = "".join(np.reshape(signal.get("Name", ""), -1)) or f"signal{index}"
+        signals[f"{name}_{index}" if name in signals else name] = signal.get("Values", element)
+    series = [_timeseries(signal) for signal in signals.values()]
+    times = [one["Time"] for one in series if one]
+    if len(times) != len(signals) or any(
+        time.size != times[0].size or not np.allclose(time, times[0], 1e-9, 1e-9) for time in times
+    ):
+        return _node_of(signals)
+    # All were logged at the same times: they make a table.
+    data = {name: one["Data"] for name, one in zip(signals, series, strict=True)}
+    return _node_of({"Time": times[0], **data})
+
+
+def _timeseries(value: Any) -> dict[str, Any]:
+    """Return time [s] and data of a timeseries; nothing of another object."""
+    held = _properties(value)
+    if not {"TimeInfo", "Data_"} <= held.keys():
+        return {}
+    times = _properties(held["TimeInfo"])
+    time = next((np.reshape(one, -1) for one in (held.get("Time_", ()), times.get("Time_", ())) if np.size(one)), None)
+    if time is None:
+        start, step, count = (float(np.reshape(times[key], -1)[0]) for key in ("Start_", "Increment_", "Length"))
+        time = start + step * np.arange(count)
+    unit = "".join(np.reshape(times.get("Units", ""), -1))
+    return {"Time": time * _SECONDS.get(unit, 1.0), "Data": held["Data_"]}
+
+
+def _node_of(values: Mapping[str, Any]) -> _Node:
+    return _Node(fields={name: partial(_node, value) for name, value in values.items()})
+
+
+def _properties(value: Any) -> dict[str, Any]:
+    """Return the properties of an object; those that its class stored in a form of its own stand under ``any``."""
+    held = dict(getattr(value, "properties", {}))
+    stored = held.pop("any", None)
+    if isinstance(stored, np.ndarray) and stored.dtype.names and stored.size == 1:
+        held |= {name: stored.flat[0][name] for name in stored.dtype.names}
+    return held
+
+
 # -- version 7.3 -------------------------------------------------------------------------------------------------
 
 
-def _hdf_variables(path: Path, _: list[str]) -> Iterator[tuple[str, _Node]]:
+def _hdf_variables(path: Path) -> Iterator[tuple[str, _Node]]:
     """Yield the variables of a file of version 7.3, which is HDF5, or of any file of HDF5."""
     try:
         import h5py
@@ -340,8 +424,19 @@ def _hdf_variables(path: Path, _: list[str]) -> Iterator[tuple[str, _Node]]:
     def follow(reference: Any) -> _Node:
         return node(file[reference])
 
+    def has_object(item: Any) -> bool:
+        return "MATLAB_object_decode" in item.attrs or (
+            h5py.check_ref_dtype(item.dtype) and any(has_object(file[one]) for one in item[()].flat)
+            if isinstance(item, h5py.Dataset)
+            else any(has_object(item[field]) for field in item)
+        )
+
+    readable = "#subsystem#" in file and find_spec("matio") is not None
     for name in file:
         if name.startswith("#"):
+            continue
+        if readable and has_object(file[name]):
+            yield name, _node(_loaded(path, name, True, ...))
             continue
         found = node(file[name])
         yield name, _struct_array(found) or found

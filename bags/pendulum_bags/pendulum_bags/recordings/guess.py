@@ -43,7 +43,7 @@ _WORDS: Mapping[str, frozenset[str]] = {
     "place": frozenset({"x", "cart", "distance", "place", "slider"}),
     "input": frozenset(
         {"u", "torque", "tau", "effort", "voltage", "volt", "volts", "pwm", "input", "command", "cmd", "action", "duty",
-         "current", "control", "motor", "force", "actuator", "moment"}
+         "vm", "current", "control", "motor", "force", "actuator", "moment"}
     ),
     "reference": frozenset({"ref", "reference", "target", "desired", "des", "setpoint", "goal", "sp", "soll"}),
     "disturbance": frozenset({"disturbance", "dist", "perturbation", "pert", "noise"}),
@@ -72,7 +72,7 @@ _PLAIN = frozenset(
 )
 _UNIT_WORDS = {
     "deg": "deg", "degrees": "deg", "rad": "rad", "ms": "ms", "us": "us", "ns": "ns", "rpm": "rpm", "nm": "N m",
-    "volt": "V", "volts": "V", "voltage": "V", "v": "V", "torque": "N m", "tau": "N m", "effort": "N m",
+    "volt": "V", "volts": "V", "voltage": "V", "v": "V", "vm": "V", "torque": "N m", "tau": "N m", "effort": "N m",
     "moment": "N m", "pwm": "-", "duty": "-",
 }  # fmt: skip
 _TOKENS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_]+")
