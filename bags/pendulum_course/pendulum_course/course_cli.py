@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
-from pendulum_msgs_py.whole_file import writing
 
 if TYPE_CHECKING:
     from pendulum_course.checks import Judgement

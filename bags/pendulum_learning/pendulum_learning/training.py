@@ -26,10 +26,10 @@ from pendulum_learning.task import SwingUpTask, ranges_of
 from pendulum_learning.teacher import Teacher
 from pendulum_lqr.policies.policy import Network, Policy, default_signals
 from pendulum_lqr.policies.policy_file import write_policy
+from pendulum_msgs_py.atomic_write import write_atomically
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_differences import describe_plants
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["EPISODES", "TASKS", "TEACHERS", "TRIALS", "Training", "checkpoint_path", "train"]
 
@@ -234,7 +234,7 @@ def _keep(
     buffer = io.BytesIO()
     np.savez(buffer, curves=np.array(curves), fastest=fastest, **arrays)
     try:
-        write_whole(path, buffer.getvalue())
+        write_atomically(path, buffer.getvalue())
     except OSError as error:
         left = "the one before it stays" if path.exists() else "nothing was written"
         raise DataError(f"checkpoint {path} cannot be written: {error.strerror}; {left}") from error

@@ -7,8 +7,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pendulum_hw_bridge.emulation.x5 import LinkState
+from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.errors import PendulumError
-from pendulum_msgs_py.whole_file import writing
 
 __all__ = ["COLUMNS", "truth_log"]
 

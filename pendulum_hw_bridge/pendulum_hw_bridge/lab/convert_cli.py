@@ -10,11 +10,11 @@ import numpy as np
 import typer
 
 from pendulum_hw_bridge.backends.hebi_log import read_hebilog, to_joint
+from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.lab_file import load_lab
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import out_option
-from pendulum_msgs_py.whole_file import writing
 
 __all__ = ["main"]
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from xml.etree import ElementTree
 
+from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import read_text, reject_unknown
-from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = [
     "DEFAULT_GAINS",
@@ -190,7 +190,7 @@ def write_gains(path: str | Path, gains: GainSet) -> Path:
     ElementTree.indent(root)
     path = Path(path)
     with writing(f"gains file {path}", ParameterError):
-        write_whole(path, '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n")
+        write_atomically(path, '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n")
     return path
 
 

@@ -32,6 +32,7 @@ from pendulum_lqr.linear.analysis import LoopReport, analyse
 from pendulum_lqr.linear.design import Gain, output_lqr
 from pendulum_lqr.linear.model import LinearModel, linearise
 from pendulum_lqr.linear.parameter_box import UNCERTAIN, parse_box, worst_case
+from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.json_values import json_text
@@ -47,7 +48,6 @@ from pendulum_msgs_py.plants.plant_parameters import (
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import make_console
-from pendulum_msgs_py.whole_file import writing
 
 __all__ = ["THESIS_CHOICE", "THESIS_WEIGHTS", "app", "main", "read_diagonal"]
 

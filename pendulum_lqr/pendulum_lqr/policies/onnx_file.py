@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.policies.policy import Network, Policy
 from pendulum_lqr.policies.policy_file import header_of
+from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = ["OPSET", "dumps_onnx", "observation_names", "write_onnx"]
 
@@ -34,7 +34,7 @@ def write_onnx(path: str | Path, policy: Policy) -> Path:
     """Write a policy as an ONNX model, atomically; DataError if it cannot be written."""
     path = Path(path)
     with writing(f"model {path}", DataError):
-        write_whole(path, dumps_onnx(policy))
+        write_atomically(path, dumps_onnx(policy))
     return path
 
 

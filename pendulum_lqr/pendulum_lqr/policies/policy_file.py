@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.policies.bounded_files import read_bounded, read_parts, sentence_of, shown
 from pendulum_lqr.policies.policy import MODELS, Network, Policy, fingerprint, model_of
+from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.errors import DataError, PendulumError
 from pendulum_msgs_py.plants.plant_differences import describe_plants, read_plants
-from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = [
     "FORMAT",
@@ -60,7 +60,7 @@ def write_policy(path: str | Path, policy: Policy) -> Path:
     path = Path(path)
     content = dumps_policy(policy)
     with writing(f"policy file {path}", DataError):
-        write_whole(path, content)
+        write_atomically(path, content)
     return path
 
 

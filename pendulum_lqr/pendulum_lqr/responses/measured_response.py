@@ -13,8 +13,8 @@ import numpy as np
 import scipy.special
 from numpy.typing import NDArray
 
+from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.errors import DataError, ParameterError
-from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = ["FORMAT", "MeasuredResponse", "read_response", "write_response"]
 
@@ -150,7 +150,7 @@ def write_response(path: str | os.PathLike[str], response: MeasuredResponse) -> 
     target = Path(path)
     text = json.dumps(response.to_json(), allow_nan=False) + "\n"
     with writing(f"response {target}", ParameterError):
-        write_whole(target, text)
+        write_atomically(target, text)
     return target
 
 

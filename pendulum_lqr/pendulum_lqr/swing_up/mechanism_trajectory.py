@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
 from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
+from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import read_text
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = [
     "FORMAT",
@@ -195,7 +195,7 @@ def write_trajectory(path: Path, trajectory: MechanismTrajectory) -> None:
     text = json.dumps(document)
     with writing(f"trajectory {path}", ParameterError):
         # One node per line, for readable differences.
-        write_whole(path, text.replace("], [", "],\n[") + "\n")
+        write_atomically(path, text.replace("], [", "],\n[") + "\n")
 
 
 def load_trajectory(path: Path) -> MechanismTrajectory:

@@ -13,12 +13,12 @@ from typing import Annotated
 import typer
 
 from pendulum_lqr.swing_up.mechanism_ilqr import IlqrWeights
+from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import counting_bar
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import out_option
 from pendulum_msgs_py.programs.terminal import make_console
-from pendulum_msgs_py.whole_file import writing
 
 __all__ = ["app", "main"]
 

@@ -25,9 +25,9 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from pendulum_msgs_py.atomic_write import write_atomically
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.loops.object_file import link, undefined_symbols
-from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = ["Loop", "NoMachineCodeError", "compile_loop", "keep_loop", "load_loop"]
 
@@ -231,7 +231,7 @@ def compile_loop(path: Path, builder: str, *choice: str) -> None:
         # All imported modules: nothing else can have changed the loop.
         "sources": {name: _digest(_source(name).read_bytes()) for name in _own_sources()},
     }
-    write_whole(path, json.dumps(head).encode() + b"\n" + code)
+    write_atomically(path, json.dumps(head).encode() + b"\n" + code)
 
 
 def _own_sources() -> list[str]:

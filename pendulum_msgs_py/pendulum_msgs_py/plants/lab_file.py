@@ -24,9 +24,9 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import dump_yaml, load_yaml, reject_unknown, require_mapping
-from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = [
     "EMULATED_BACKENDS",
@@ -220,7 +220,7 @@ def write_lab(path: str | Path, lab: LabFile) -> Path:
     if lab.proofs:
         document["proofs"] = {name: dict(proof) for name, proof in lab.proofs.items()}
     with writing(f"lab file {path}", ParameterError):
-        write_whole(path, _HEADER + dump_yaml(document, "lab file"))
+        write_atomically(path, _HEADER + dump_yaml(document, "lab file"))
     return path
 
 

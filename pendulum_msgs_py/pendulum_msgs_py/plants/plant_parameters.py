@@ -38,6 +38,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.contract.joints import Coordinates, Joint, Vector
 from pendulum_msgs_py.dynamics.joint_steps import FAR, JointTable
 from pendulum_msgs_py.errors import ParameterError
@@ -68,7 +69,6 @@ from pendulum_msgs_py.plants.quantities import (
     read_quantities,
     write_quantities,
 )
-from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = [
     "FORMAT",
@@ -598,7 +598,7 @@ def write_plant(
     document = plant_document(parameters, intervals)
     text = dump_yaml({**document, "provenance": dict(provenance)} if provenance else document, f"plant file {path}")
     with writing(f"plant file {path}", ParameterError):
-        write_whole(path, text)
+        write_atomically(path, text)
     return path
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
-from pendulum_msgs_py.whole_file import write_whole
+from pendulum_msgs_py.atomic_write import write_atomically
 
 __all__ = ["KernelStore", "drop_stale_code", "keep_kernel", "name_symbols_apart"]
 
@@ -89,7 +89,7 @@ class KernelStore:
         if _COUNTED.search(content):
             return
         with contextlib.suppress(OSError):
-            write_whole(self._path(signature, compiled.library.codegen), self._head(content) + b"\n" + content)
+            write_atomically(self._path(signature, compiled.library.codegen), self._head(content) + b"\n" + content)
 
     def enable(self) -> None:
         """Do nothing: a store is always on."""

@@ -15,6 +15,7 @@ from xml.etree import ElementTree
 
 import typer
 
+from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.errors import ParameterError
@@ -25,7 +26,6 @@ from pendulum_msgs_py.plants.joint_parameters import JointParameters, SeriesElas
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import out_option
-from pendulum_msgs_py.whole_file import write_whole, writing
 from pendulum_sim.exports.ros2_control_tags import add_ros2_control
 from pendulum_sim.exports.xml_files import add, document_text, lateness, number, safe_name
 
@@ -276,7 +276,7 @@ def export(
         typer.echo(text, nl=False)
         return
     with writing(f"model file {output}", ParameterError):
-        write_whole(output, text)
+        write_atomically(output, text)
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.whole_file import writing
 from pendulum_sim.pictures.canvas import Picture
 
 __all__ = ["Window", "save_gif", "save_png"]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
+from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.equilibrium import (
     FixedPoint,
@@ -17,7 +18,6 @@ from pendulum_msgs_py.plants.equilibrium import (
     total_damping,
 )
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from pendulum_msgs_py.whole_file import writing
 
 __all__ = ["overdamped_points", "plot_overdamped_phase", "save_figure"]
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pendulum_bags.figures.figure import ROLES, Figure, Panel, Trace, thinned
+from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.errors import BagError
-from pendulum_msgs_py.whole_file import writing
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,8 +10,8 @@ from pendulum_bags.figures.numbers import quantity
 from pendulum_bags.figures.table import Table
 from pendulum_bags.pages.html import render
 from pendulum_bags.verdict import LayerResult, name_in
+from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.errors import BagError
-from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = ["evidence_table", "write_layer_page"]
 
@@ -34,7 +34,7 @@ def write_layer_page(
     figures, layers, shown, notes = name_in((figures, layers, shown, notes), emulated=emulated)
     text = render("layer.html.j2", figures, title=title, layers=layers, tables=shown, notes=notes, emulated=emulated)
     with writing(f"page {path}", BagError):
-        write_whole(path, text)
+        write_atomically(path, text)
     return path
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from pendulum_bags.figures.table import Table
 from pendulum_bags.pages.html import encoded, render_plain
+from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.whole_file import write_whole, writing
 
 __all__ = ["Sentence", "write_sheet"]
 
@@ -50,5 +50,5 @@ def write_sheet(
         pictures=[(one.stem.replace("_", " "), encoded(one.read_bytes())) for one in pictures],
     )
     with writing(f"page {path}", DataError):
-        write_whole(path, text)
+        write_atomically(path, text)
     return path

@@ -321,7 +321,7 @@ def write_mapping(path: Path, readings: Sequence[Reading]) -> None:
     """Write the mappings of some recordings to a file that ``--mapping`` reads; one for all where they are alike."""
     import yaml
 
-    from pendulum_msgs_py.whole_file import write_whole
+    from pendulum_msgs_py.atomic_write import write_atomically
 
     each: dict[str, Any] = {}
     for reading in readings:
@@ -336,7 +336,7 @@ def write_mapping(path: Path, readings: Sequence[Reading]) -> None:
         content = {"format": contents[0]["format"], "recordings": {}}
         for name, rules in each.items():
             content["recordings"][name] = {key: value for key, value in rules.items() if key != "format"}
-    write_whole(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
+    write_atomically(path, yaml.safe_dump(content, sort_keys=False, allow_unicode=True, width=120))
 
 
 def guess_rows(readings: Sequence[Reading]) -> list[tuple[tuple[str, ...], bool]]:

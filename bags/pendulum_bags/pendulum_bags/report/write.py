@@ -16,8 +16,8 @@ from pendulum_bags.report.page import Page, page_of, render_page
 from pendulum_bags.report.tables import make_tables
 from pendulum_bags.verdict.answer import answer_of
 from pendulum_bags.verdict.naming import name_in
+from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.errors import BagError
-from pendulum_msgs_py.whole_file import write_whole, writing
 from pendulum_rosbag.reader import read_bag
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def _save(out: Path, page: Page, formats: Sequence[str]) -> Path:
     text = render_page(page, {path.stem: _for_paper(path) for path in drawn if path.suffix == ".png"})
     target = out / "report.html"
     with writing(f"report {target}", BagError):
-        write_whole(target, text)
+        write_atomically(target, text)
     return target
 
 

@@ -14,9 +14,9 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+from pendulum_msgs_py.atomic_write import write_atomically
 from pendulum_msgs_py.errors import BagError
 from pendulum_msgs_py.json_values import json_text
-from pendulum_msgs_py.whole_file import write_whole
 
 __all__ = [
     "REPEATS",
@@ -183,4 +183,4 @@ def git_revision() -> str:
 
 def write_json(path: Path, content: Any) -> None:
     """Write JSON so that the file appears whole or not at all."""
-    write_whole(path, json_text(content) + "\n")
+    write_atomically(path, json_text(content) + "\n")

@@ -20,7 +20,7 @@ from pendulum_bags.studies.leaderboard import (
     PERTURBATIONS,
     Entry,
 )
-from pendulum_msgs_py.whole_file import write_whole
+from pendulum_msgs_py.atomic_write import write_atomically
 
 __all__ = ["best_sentence", "to_json", "write_page"]
 
@@ -54,7 +54,7 @@ def write_page(path: Path, entries: Sequence[Entry], duration: float) -> Path:
         sentence=best_sentence(entries),
         provenance={"revision": git_revision() or "unknown", **versions()},
     )
-    write_whole(path, text)
+    write_atomically(path, text)
     return path
 
 

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_msgs_py.json_values import json_text
-from pendulum_msgs_py.whole_file import writing
 from pendulum_rosbag.reader.bag import Bag
 from pendulum_rosbag.reader.joint_table import JointTable
 

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.contract.names import APPLIED_EFFORT, DISTURBANCE, JOINT_STATES
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_msgs_py.json_values import without_nan
 from pendulum_msgs_py.programs.extras import how_to_install
-from pendulum_msgs_py.whole_file import writing
 from pendulum_rosbag.reader.bag import Bag
 from pendulum_rosbag.reader.decode import store_for
 from pendulum_rosbag.reader.joint_table import joint_table

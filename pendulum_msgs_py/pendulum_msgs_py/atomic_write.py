@@ -12,13 +12,13 @@ from pathlib import Path
 
 from pendulum_msgs_py.errors import PendulumError
 
-__all__ = ["write_whole", "writing"]
+__all__ = ["write_atomically", "writing"]
 
 _NOT_REPLACED = {errno.EACCES, errno.EPERM, errno.EBUSY, errno.EROFS, errno.EINVAL}
 """Errors of replacing a writable file: no right to its folder or owner, or it is a mount."""
 
 
-def write_whole(path: Path, content: str | bytes) -> None:
+def write_atomically(path: Path, content: str | bytes) -> None:
     """Write bytes, or text as UTF-8, to a file atomically, with the folders above it.
 
     No temporary file remains after a full disk or Ctrl-C. Links stay links; a file keeps owner and mode. What must not
@@ -37,10 +37,10 @@ def write_whole(path: Path, content: str | bytes) -> None:
     except ValueError as error:
         raise OSError(errno.EINVAL, str(error), str(path)) from error
     except RuntimeError as error:
-        raise _circle(path) from error
+        raise _link_cycle(path) from error
     # Newer Pythons resolve a cycle of links as far as they get.
     if target.is_symlink():
-        raise _circle(path)
+        raise _link_cycle(path)
     status = path.stat() if path.exists() else None
     if status is not None and not _may_be_replaced(target, status):
         path.write_bytes(data)
@@ -72,23 +72,23 @@ def _may_be_replaced(target: Path, status: os.stat_result) -> bool:
 
 def _replace(target: Path, data: bytes, status: os.stat_result | None) -> None:
     # A random name cannot be a link that another user prepared, nor the name of another thread.
-    beside = target.with_name(f".{secrets.token_hex(8)}")
+    temporary = target.with_name(f".{secrets.token_hex(8)}")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         # The temporary file must not be more readable than the one that it replaces.
         mode = 0o666 if status is None else 0o600
-        with open(beside, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
+        with open(temporary, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             file.write(data)
         if status is not None:
-            os.chown(beside, status.st_uid, status.st_gid)
-            beside.chmod(stat.S_IMODE(status.st_mode))
-        beside.replace(target)
+            os.chown(temporary, status.st_uid, status.st_gid)
+            temporary.chmod(stat.S_IMODE(status.st_mode))
+        temporary.replace(target)
     finally:
         with suppress(OSError):
-            beside.unlink(missing_ok=True)
+            temporary.unlink(missing_ok=True)
 
 
-def _circle(path: Path) -> OSError:
+def _link_cycle(path: Path) -> OSError:
     return OSError(errno.ELOOP, os.strerror(errno.ELOOP), str(path))
 
 
