@@ -9,8 +9,8 @@ from xml.etree import ElementTree
 
 import pytest
 
-from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.host_pool import HostPool
+from pendulum_bags.experiments.orchestrator_node import Orchestrator, PlantClient, RecorderClient
 from pendulum_bags.experiments.processes import ProcessSet, ros_environment, start_recorder
 from pendulum_console.console.console_node import Hub
 from pendulum_msgs_py.contract import names
@@ -79,7 +79,7 @@ def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, hosts:
     allowed = granted()
     with (
         ProcessSet(tmp_path, ros_environment(domain_id, tmp_path), hosts) as processes,
-        Conductor(domain_id) as conductor,
+        Orchestrator(domain_id) as orchestrator,
     ):
         for program in programs:
             processes.start_node(program)
@@ -87,11 +87,11 @@ def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, hosts:
         hub = Hub()
         try:
             for side, plant in PLANTS.items():
-                PlantClient(conductor, side, plant).wait_until_ready(100.0)
-            RecorderClient(conductor, "/hw").heard()
+                PlantClient(orchestrator, side, plant).wait_until_ready(100.0)
+            RecorderClient(orchestrator, "/hw").heard()
             with pytest.raises(FaultError, match="refuses"):
-                PlantClient(conductor, "/hw", "bridge").call("procedure/finish")
-            conductor.wait_for("the console to see both plants", lambda: set(hub.plants()) == set(PLANTS), 60.0)
+                PlantClient(orchestrator, "/hw", "bridge").call("procedure/finish")
+            orchestrator.wait_for("the console to see both plants", lambda: set(hub.plants()) == set(PLANTS), 60.0)
             asyncio.run(_drive(hub))
             here = {program.full_name for program in programs}
             here |= {"/hw/recorder", "/conductor", "/console", "/hw/bridge_e_stop", "/sim/simulator_e_stop"}
@@ -105,7 +105,7 @@ def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, hosts:
                 found.clear()
                 for full in sorted(here):
                     try:
-                        now = used_by(conductor.node, full)
+                        now = used_by(orchestrator.node, full)
                     except Exception as error:  # noqa: BLE001 (rclpy's NodeNameNonExistentError while it starts)
                         assert "exist" in str(error)  # noqa: PT017
                         found[full] = "is not there yet", {}
@@ -120,7 +120,7 @@ def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, hosts:
                 return not found
 
             try:
-                conductor.wait_for("all endpoints", as_allowed, 100.0)
+                orchestrator.wait_for("all endpoints", as_allowed, 100.0)
             except FaultError:
                 pytest.fail("\n".join(f"{full}: never uses {a}, is not allowed {b}" for full, (a, b) in found.items()))
         finally:

@@ -19,9 +19,9 @@ import pytest
 
 from pendulum_bags.commands.experiment_cli import main
 from pendulum_bags.experiments import lockstep
-from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.host_pool import HostedProgram, HostPool, keep_pool
 from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.orchestrator_node import Orchestrator, PlantClient, RecorderClient
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
@@ -93,7 +93,7 @@ def test_lockstep_runs_of_a_policy_on_the_emulated_hardware_with_one_seed_are_id
     run_experiment("lockstep", "--side", "hw", "--bag", first_bag, "--seed", 5, "--duration", "1", "--controller", path)
     # A bridge offers its services before its emulator is compiled, half a minute on a busy machine the first time, and
     # is waited for as long as any start. Here a call that does not say how long it waits waits for nothing.
-    monkeypatch.setattr(Conductor.call, "__defaults__", (0.0,))
+    monkeypatch.setattr(Orchestrator.call, "__defaults__", (0.0,))
     ran_in = []
     # In one domain: what is left of the first run would be counted among those who hear the second.
     for name, seed in (("other", 6), ("in_the_same_processes", 5)):
@@ -127,14 +127,14 @@ def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
     looks, newest, now, asking = 0, 0, 0.0, False
     counts: list[int] = []
     recorders: list[RecorderClient] = []
-    wait_for, received = Conductor.wait_for, RecorderClient.received
+    wait_for, received = Orchestrator.wait_for, RecorderClient.received
 
-    def noted(conductor: Conductor, what: str, *arguments: Any, **more: Any) -> Any:
+    def noted(orchestrator: Orchestrator, what: str, *arguments: Any, **more: Any) -> Any:
         nonlocal looks
         looks += what == "the end of a run of 20 s of simulated time"
         if looks and not recorders:
-            recorders.append(RecorderClient(conductor, "/sim"))
-        return wait_for(conductor, what, *arguments, **more)
+            recorders.append(RecorderClient(orchestrator, "/sim"))
+        return wait_for(orchestrator, what, *arguments, **more)
 
     def counted(recorder: RecorderClient, topic: str) -> int:
         counts.append(received(recorder, topic))
@@ -162,10 +162,10 @@ def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
         if newest == before:
             now += lockstep._PATIENCE
 
-    monkeypatch.setattr(Conductor, "wait_for", noted)
+    monkeypatch.setattr(Orchestrator, "wait_for", noted)
     monkeypatch.setattr(RecorderClient, "received", counted)
     monkeypatch.setattr(lockstep, "time", SimpleNamespace(monotonic=lambda: now))
-    # The conductor knows the state of one joint only, and looks away from any.
+    # The orchestrator knows the state of one joint only, and looks away from any.
     spec = RunSpec(plant="cart_pole", design_plant="cart_pole", duration=20.0)
     with pytest.raises(
         FaultError,

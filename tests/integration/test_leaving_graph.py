@@ -43,9 +43,9 @@ with leaving_graph():
     print("hangs", flush=True)
     ctypes.PyDLL(None).sleep(600)
 """
-_CONDUCTOR = """
-from pendulum_bags.experiments.conductor_node import Conductor
-with Conductor({domain}):
+_ORCHESTRATOR = """
+from pendulum_bags.experiments.orchestrator_node import Orchestrator
+with Orchestrator({domain}):
     pass
 """
 _IN_TIME = """
@@ -92,7 +92,7 @@ def hanging(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Runn
 
         for name in _PLANT_NODES:
             start(name, _HANGING.format(name=name) + _SIMULATOR)
-        start("conductor", _HANGING.format(name="conductor") + _CONDUCTOR)
+        start("orchestrator", _HANGING.format(name="conductor") + _ORCHESTRATOR)
         start("nested", _NESTED)
         start("in time", _IN_TIME)
         if importlib.util.find_spec("hebi"):
@@ -116,8 +116,8 @@ def test_a_plant_that_cannot_leave_the_graph_ends_all_the_same(name: str, hangin
 
 
 def test_an_experiment_that_cannot_leave_the_graph_ends_all_the_same(hanging: dict[str, RunningProgram]) -> None:
-    assert hanging["conductor"].wait(DEADLINE) == 1
-    assert "hangs" in hanging["conductor"].output
+    assert hanging["orchestrator"].wait(DEADLINE) == 1
+    assert "hangs" in hanging["orchestrator"].output
 
 
 def test_the_end_of_one_leaving_does_not_end_the_watch_over_another(hanging: dict[str, RunningProgram]) -> None:

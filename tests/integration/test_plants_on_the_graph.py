@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_bags.experiments.conductor_node import Conductor
 from pendulum_bags.experiments.graph_plant import join
+from pendulum_bags.experiments.orchestrator_node import Orchestrator
 from pendulum_msgs_py.errors import FaultError
 from pendulum_rosbag.reader import read_bag
 from pendulum_testing.plant_peer import PlantPeer
@@ -97,14 +97,14 @@ def test_a_commander_who_is_met_later_than_the_plant_is_noticed(
     processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/lab", "-p", "armed_at_start:=false")
     peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "the plant")
     asked: list[str] = []
-    with Conductor(domain_id) as conductor:
-        conductor.wait_for("the peer", lambda: conductor.node.count_publishers("/lab/effort_command"), 30.0)
-        count = conductor.node.count_publishers
+    with Orchestrator(domain_id) as orchestrator:
+        orchestrator.wait_for("the peer", lambda: orchestrator.node.count_publishers("/lab/effort_command"), 30.0)
+        count = orchestrator.node.count_publishers
 
         def late(topic: str) -> int:
             asked.append(topic)
             return count(topic) if asked.count(topic) > 1 else 0
 
-        monkeypatch.setattr(conductor.node, "count_publishers", late)
+        monkeypatch.setattr(orchestrator.node, "count_publishers", late)
         with pytest.raises(FaultError, match="/lab/effort_command has 1 publisher: somebody else commands this plant"):
-            join(conductor, "/lab")
+            join(orchestrator, "/lab")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pendulum_bags.experiments.conductor_node import PlantClient
+from pendulum_bags.experiments.orchestrator_node import PlantClient
 from pendulum_bags.experiments.processes import Child
 from pendulum_bags.experiments.session import LOOP_NICENESS, conduct
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
@@ -64,7 +64,7 @@ def test_what_breaks_a_session_off_disarms_a_plant_that_it_drives_and_no_other(
 
     def run(ending: type[BaseException]) -> None:
         with conduct(tmp_path / "logs", domain_id) as session:
-            plants = [PlantClient(session.conductor, namespace, "simulator") for namespace in simulators]
+            plants = [PlantClient(session.orchestrator, namespace, "simulator") for namespace in simulators]
             for plant in plants:
                 plant.wait_until_ready(60.0, controller=False, disturbance=False)
             plants[0].arm()
@@ -92,15 +92,15 @@ def test_a_move_that_a_stopped_plant_refuses_is_told_by_what_stopped_it(
 ) -> None:
     processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim")
     with conduct(tmp_path / "logs", domain_id) as session:
-        plant = PlantClient(session.conductor, "/sim", "simulator")
+        plant = PlantClient(session.orchestrator, "/sim", "simulator")
         plant.wait_until_ready(60.0, controller=False, disturbance=False)
         plant.call("simulator/e_stop")
-        session.conductor.wait_for(
+        session.orchestrator.wait_for(
             "the stop", lambda: any(event.get("mode") == "e_stop" for event in plant.events), 20.0
         )
         plant.follow(thesis_ramp(0.0, 0.5), "ramp_up")
         with pytest.raises(PlantStoppedError) as stopped:
-            session.conductor.wait_for("the end of the move", plant.trajectory_finished, 20.0)
+            session.orchestrator.wait_for("the end of the move", plant.trajectory_finished, 20.0)
     assert stopped.value.mode == "e_stop"
 
 

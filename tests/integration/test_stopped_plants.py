@@ -124,14 +124,14 @@ def test_a_session_ends_at_once_with_the_plant_that_is_stopped_or_dies_on_its_wa
 
     def move() -> None:
         with conduct(tmp_path / "logs", lab.domain) as session:
-            plant = join(session.conductor, "/lab")
+            plant = join(session.orchestrator, "/lab")
             session.drives(plant)
             plant.arm()
             assert plant.sample is not None
             plant.follow(thesis_ramp(plant.sample.position[0], UPRIGHT), "ramp_up")
-            session.conductor.wait_for("the plant to follow", plant.is_following, 5.0)
+            session.orchestrator.wait_for("the plant to follow", plant.is_following, 5.0)
             stop()
-            session.conductor.wait_for("the end of the move", plant.trajectory_finished, 20.0)
+            session.orchestrator.wait_for("the end of the move", plant.trajectory_finished, 20.0)
 
     with pytest.raises(FaultError, match=told):
         move()

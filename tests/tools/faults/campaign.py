@@ -220,7 +220,7 @@ def _flood(topic: str) -> Callable[[LiveSystem, random.Random], Outcome]:
 
 
 def _service_storm(system: LiveSystem, _generator: random.Random) -> Outcome:
-    client = system.conductor.node.create_client(Trigger, system.service(names.E_STOP_RESET))
+    client = system.orchestrator.node.create_client(Trigger, system.service(names.E_STOP_RESET))
     system.wait_for("the service", client.service_is_ready, 10.0)
     futures = []
     for _ in range(1000):
@@ -233,7 +233,7 @@ def _service_storm(system: LiveSystem, _generator: random.Random) -> Outcome:
     outcome.demand(bool(answered), "no call was answered")
     outcome.demand(all(not future.result().success for future in answered), "a reset of no e-stop succeeded")
     _demand_rate(outcome, system)
-    system.conductor.node.destroy_client(client)
+    system.orchestrator.node.destroy_client(client)
     return outcome
 
 

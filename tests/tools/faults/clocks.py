@@ -151,7 +151,7 @@ def stop_simulated_clock(folder: Path, believers: tuple[str, ...]) -> Outcome:
     outcome = Outcome()
     parameters = {name: {"use_sim_time": True} for name in believers}
     with reserve_domain() as domain, LiveSystem(folder, domain, parameters=parameters) as system:
-        publisher = system.conductor.node.create_publisher(Clock, names.CLOCK, qos.CLOCK)
+        publisher = system.orchestrator.node.create_publisher(Clock, names.CLOCK, qos.CLOCK)
         told = 100 * NANOSECONDS
 
         def run(seconds: float) -> None:

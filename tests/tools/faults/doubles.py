@@ -77,7 +77,7 @@ def _twin_controller(system: LiveSystem, _: random.Random) -> Outcome:
     topic = f"{system.plant.namespace}/{names.EFFORT_COMMAND}"
 
     def controllers() -> set[tuple[int, ...]]:
-        infos = system.conductor.node.get_publishers_info_by_topic(topic)
+        infos = system.orchestrator.node.get_publishers_info_by_topic(topic)
         return {tuple(info.endpoint_gid) for info in infos if info.node_name == "controller"}
 
     # One that was killed shortly before is on the graph until its lease ends.
@@ -131,14 +131,14 @@ def _second_bridge(system: LiveSystem, _: random.Random) -> Outcome:
     """Let a second bridge take the same module, and be armed where it can be: nobody asks it for torque."""
     program = system.program("bridge")
     second = system.processes.start_node(type(program)(**{**vars(program), "namespace": "/other"}))
-    client = system.conductor.node.create_client(SetBool, "/other/bridge/arm")
+    client = system.orchestrator.node.create_client(SetBool, "/other/bridge/arm")
     system.wait_for("the second bridge", client.service_is_ready, START_TIMEOUT)
-    answer = system.conductor.call(client, SetBool.Request(data=True), "the answer to arming", START_TIMEOUT)
+    answer = system.orchestrator.call(client, SetBool.Request(data=True), "the answer to arming", START_TIMEOUT)
     system.listen(1.0)
     outcome = Outcome()
     code = system.processes.finish(second)
     outcome.demand(code == 0, f"the second bridge ended with code {code}: {second.last_words(1)}")
-    system.conductor.node.destroy_client(client)
+    system.orchestrator.node.destroy_client(client)
     first = "goes on" if system.torque_flows() else f"{system.mode()}"
     outcome.detail = outcome.detail or f"second {'armed' if answer.success else 'refused'}, first {first}"
     return outcome

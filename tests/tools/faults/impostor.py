@@ -48,7 +48,7 @@ class _Impostor:
         self.newest_ns = 0
         self.pending: list[tuple[float, int]] = []
         self.answer: Callable[[int], None] = lambda _stamp_ns: None
-        node = self.system.conductor.node
+        node = self.system.orchestrator.node
         self._publisher = node.create_publisher(
             JointState, f"{self.system.plant.namespace}/{names.EFFORT_COMMAND}", qos.COMMAND
         )
@@ -76,8 +76,8 @@ class _Impostor:
         # A state that has come already is still handed over.
         self.answer = lambda _stamp_ns: None
         self.pending.clear()
-        self.system.conductor.node.destroy_subscription(self._states)
-        self.system.conductor.node.destroy_publisher(self._publisher)
+        self.system.orchestrator.node.destroy_subscription(self._states)
+        self.system.orchestrator.node.destroy_publisher(self._publisher)
 
     def _on_state(self, data: bytes) -> None:
         fields = decode_joint_state(data)

@@ -15,7 +15,7 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool
 
-from pendulum_bags.experiments.conductor_node import Conductor
+from pendulum_bags.experiments.orchestrator_node import Orchestrator
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiments.session import (
     ANSWER_PRIORITY,
@@ -145,14 +145,14 @@ class LiveSystem:
         logs = self.folder / "logs"
         self.processes = ProcessSet(logs, {**ros_environment(self.domain, logs), **self._environment})
         self.processes.__enter__()
-        self.conductor = Conductor(self.domain, watch=self._hear)
-        self.conductor.__enter__()
-        node, namespace = self.conductor.node, self.plant.namespace
+        self.orchestrator = Orchestrator(self.domain, watch=self._hear)
+        self.orchestrator.__enter__()
+        node, namespace = self.orchestrator.node, self.plant.namespace
         node.create_subscription(
             JointState, f"{namespace}/{names.APPLIED_EFFORT}", self._on_applied, qos.STATE, raw=True
         )
         # The numbers of messages, which tell what was not heard, come with those that are taken by hand alone.
-        self._witness = PollingNode("witness", context=self.conductor.context, start_parameter_services=False)
+        self._witness = PollingNode("witness", context=self.orchestrator.context, start_parameter_services=False)
         self._inputs = {
             topic: self._witness.create_polled_input(JointState, f"{namespace}/{topic}", qos.COMMAND)
             for topic in _RIGHTFUL
@@ -171,7 +171,7 @@ class LiveSystem:
         """End everything."""
         self.processes.stop()
         self._witness.destroy_node()
-        self.conductor.__exit__(None, None, None)
+        self.orchestrator.__exit__(None, None, None)
 
     # --- processes -----------------------------------------------------------------------------------------
 
@@ -246,7 +246,7 @@ class LiveSystem:
 
     def is_on_graph(self, name: str) -> bool:
         """Tell whether a node of this name has been discovered."""
-        return (name, self.plant.namespace) in self.conductor.node.get_node_names_and_namespaces()
+        return (name, self.plant.namespace) in self.orchestrator.node.get_node_names_and_namespaces()
 
     def alive(self) -> list[str]:
         """Return the names of the nodes that run."""
@@ -267,7 +267,7 @@ class LiveSystem:
 
     def wait_for(self, what: str, predicate: Callable[[], bool], timeout: float) -> None:
         """Wait until a predicate holds; raises FaultError with ``what`` otherwise."""
-        self.conductor.wait_for(what, predicate, timeout)
+        self.orchestrator.wait_for(what, predicate, timeout)
 
     def torque_flows(self) -> bool:
         """Tell whether torque was applied within the last 50 ms."""
@@ -331,7 +331,9 @@ class LiveSystem:
 
     def arm(self, on: bool = True) -> str:
         """Arm or disarm; return why not, or an empty string."""
-        answer: Any = self.conductor.call(self._arming, SetBool.Request(data=on), "the answer to arming", START_TIMEOUT)
+        answer: Any = self.orchestrator.call(
+            self._arming, SetBool.Request(data=on), "the answer to arming", START_TIMEOUT
+        )
         return "" if answer.success else str(answer.message)
 
     def bring_back(self, what: str, *, heard: bool = False) -> None:
@@ -385,7 +387,7 @@ class LiveSystem:
 
     def publisher(self, topic: str) -> Publisher:
         """Return a publisher of the probe's on one of the plant's inputs."""
-        return self.conductor.node.create_publisher(JointState, f"{self.plant.namespace}/{topic}", qos.COMMAND)
+        return self.orchestrator.node.create_publisher(JointState, f"{self.plant.namespace}/{topic}", qos.COMMAND)
 
     def attack(self, topic: str, messages: Iterable[JointState | bytes], *, rate: float | None = None) -> int:
         """Publish messages on an input and return how many were sent.
@@ -408,7 +410,7 @@ class LiveSystem:
             elif sent % 200 == 0:
                 self._listen_once(0.0)
         self.listen(0.2)
-        self.conductor.node.destroy_publisher(publisher)
+        self.orchestrator.node.destroy_publisher(publisher)
         return sent
 
     def flood(self, effort: float) -> Iterable[bytes]:
@@ -422,7 +424,7 @@ class LiveSystem:
             self.applied.append(Applied(time.monotonic(), fields.effort[0], fields.stamp_ns))
 
     def _listen_once(self, duration: float) -> None:
-        self.conductor.listen(duration)
+        self.orchestrator.listen(duration)
         self._hear()
 
     def _hear(self) -> None:

@@ -62,7 +62,7 @@ def _press(load: Load) -> Callable[[LiveSystem, random.Random], Outcome]:
 
     def act(system: LiveSystem, generator: random.Random) -> Outcome:
         outcome = Outcome()
-        reset = system.conductor.node.create_client(Trigger, system.service(names.E_STOP_RESET))
+        reset = system.orchestrator.node.create_client(Trigger, system.service(names.E_STOP_RESET))
         button = _Button(system)
         try:
             with load(system, generator):
@@ -78,10 +78,10 @@ def _press(load: Load) -> Callable[[LiveSystem, random.Random], Outcome]:
         demand_rest(outcome, system, pressed_ns)
         refusal = system.arm()
         outcome.demand("e-stop is latched" in refusal, f"arming after the e-stop: {refusal or 'accepted'}")
-        outcome.demand(system.conductor.call(reset, Trigger.Request(), "the reset").success, "no e-stop to reset")
+        outcome.demand(system.orchestrator.call(reset, Trigger.Request(), "the reset").success, "no e-stop to reset")
         system.listen(0.3)
         demand_rest(outcome, system, pressed_ns)
-        system.conductor.node.destroy_client(reset)
+        system.orchestrator.node.destroy_client(reset)
         if not system.plant.has_module:
             _arm_upright(system)
         return outcome
@@ -91,13 +91,13 @@ def _press(load: Load) -> Callable[[LiveSystem, random.Random], Outcome]:
 
 def _arm_upright(system: LiveSystem) -> None:
     """Put a simulated pendulum upright and arm it: it has fallen, and no plant is armed into full torque."""
-    client = system.conductor.node.create_client(Trigger, system.service("~/reset"))
+    client = system.orchestrator.node.create_client(Trigger, system.service("~/reset"))
 
     def armed() -> bool:
-        return system.conductor.call(client, Trigger.Request(), "the reset").success and not system.arm()
+        return system.orchestrator.call(client, Trigger.Request(), "the reset").success and not system.arm()
 
     system.wait_for("the simulator to be armed upright", armed, START_TIMEOUT)
-    system.conductor.node.destroy_client(client)
+    system.orchestrator.node.destroy_client(client)
 
 
 @contextmanager
@@ -126,13 +126,13 @@ def _flooded(kind: str) -> Load:
 def _arming(system: LiveSystem, generator: random.Random) -> Iterator[None]:
     """Let the plant be in the middle of arming: settings are written and read back."""
     system.arm(False)
-    client = system.conductor.node.create_client(SetBool, system.service(names.ARM))
+    client = system.orchestrator.node.create_client(SetBool, system.service(names.ARM))
     system.wait_for("the service", client.service_is_ready, START_TIMEOUT)
     future = client.call_async(SetBool.Request(data=True))
     time.sleep(generator.uniform(0.0, 0.01))
     yield
     system.wait_for("the answer to arming", future.done, START_TIMEOUT)
-    system.conductor.node.destroy_client(client)
+    system.orchestrator.node.destroy_client(client)
 
 
 PRESSES: tuple[Fault, ...] = (

@@ -15,8 +15,8 @@ from rclpy.publisher import Publisher
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from pendulum_bags.experiments.conductor_node import Conductor, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.orchestrator_node import Orchestrator, RecorderClient
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract.cdr import encode_joint_state
@@ -137,34 +137,34 @@ def recorder_cannot_begin(folder: Path) -> Outcome:
 
 
 @contextmanager
-def _recording(folder: Path) -> Iterator[tuple[Conductor, ProcessSet, Child, Path]]:
+def _recording(folder: Path) -> Iterator[tuple[Orchestrator, ProcessSet, Child, Path]]:
     """Run a recorder in a domain of its own, with nobody else."""
     logs, bag = folder / "logs", folder / "bag"
     write_json(folder / "metadata.json", {"pendulum.run": {"experiment": "faults"}})
     with (
         reserve_domain() as domain,
         ProcessSet(logs, ros_environment(domain, logs)) as processes,
-        Conductor(domain) as conductor,
+        Orchestrator(domain) as orchestrator,
     ):
         child = start_recorder(processes, bag, "/sim", folder / "metadata.json", "mcap")
-        yield conductor, processes, child, bag
+        yield orchestrator, processes, child, bag
 
 
-def _record_some(conductor: Conductor, bag: Path) -> tuple[Publisher, int]:
+def _record_some(orchestrator: Orchestrator, bag: Path) -> tuple[Publisher, int]:
     """Publish states until some are in the bag; return the publisher, and how many are sealed."""
-    publisher = conductor.node.create_publisher(JointState, _TOPIC, qos.STATE)
-    recorder = RecorderClient(conductor, "/sim")
+    publisher = orchestrator.node.create_publisher(JointState, _TOPIC, qos.STATE)
+    recorder = RecorderClient(orchestrator, "/sim")
     recorder.wait_until_heard([_TOPIC], _TIMEOUT)
     deadline = time.monotonic() + _TIMEOUT
     while (sealed := _states_in(bag)) < _ENOUGH and time.monotonic() < deadline:
         for _ in range(50):
-            _publish_state(conductor, publisher)
+            _publish_state(orchestrator, publisher)
     return publisher, sealed
 
 
-def _publish_state(conductor: Conductor, publisher: Publisher) -> None:
+def _publish_state(orchestrator: Orchestrator, publisher: Publisher) -> None:
     publisher.publish(encode_joint_state(time.time_ns(), position=3.1, velocity=0.0, effort=0.1))
-    conductor.listen(0.002)
+    orchestrator.listen(0.002)
 
 
 def _states_in(bag: Path) -> int:
@@ -175,12 +175,12 @@ def _states_in(bag: Path) -> int:
 def recorder_loses_its_folder(folder: Path) -> Outcome:
     """Take the right to write to its folder from a recorder that runs, and end it."""
     outcome = Outcome(lost=0.0)
-    with _recording(folder) as (conductor, processes, child, bag):
-        publisher, sealed = _record_some(conductor, bag)
+    with _recording(folder) as (orchestrator, processes, child, bag):
+        publisher, sealed = _record_some(orchestrator, bag)
         with _frozen(bag):
             deadline = time.monotonic() + 5.0
             while child.process.poll() is None and time.monotonic() < deadline:
-                _publish_state(conductor, publisher)
+                _publish_state(orchestrator, publisher)
             # A recorder that had no reason to look at its folder finds out at its end.
             code = processes.finish(child, _TIMEOUT)
         _demand_sentence(outcome, "recorder", code, child.last_words(6), "operation not permitted", "permission denied")
@@ -198,17 +198,17 @@ def recorder_runs_out_of_memory(folder: Path, headroom: int = 48 << 20) -> Outco
         headroom: What it may take beyond what it has [bytes].
     """
     outcome = Outcome(lost=0.0)
-    with _recording(folder) as (conductor, _, child, bag):
-        _, sealed = _record_some(conductor, bag)
+    with _recording(folder) as (orchestrator, _, child, bag):
+        _, sealed = _record_some(orchestrator, bag)
         pages = int(Path(f"/proc/{child.process.pid}/statm").read_text(encoding="ascii").split()[0])
         limit = pages * os.sysconf("SC_PAGE_SIZE") + headroom
         resource.prlimit(child.process.pid, resource.RLIMIT_AS, (limit, limit))
-        publisher = conductor.node.create_publisher(String, _NOISE_TOPIC, qos.DIAGNOSTICS)
+        publisher = orchestrator.node.create_publisher(String, _NOISE_TOPIC, qos.DIAGNOSTICS)
         message = String(data="x" * (2 << 20))
         deadline = time.monotonic() + _TIMEOUT
         while child.process.poll() is None and time.monotonic() < deadline:
             publisher.publish(message)
-            conductor.listen(0.002)
+            orchestrator.listen(0.002)
         _demand_sentence(outcome, "recorder", child.process.poll(), child.log.read_text(), *_SHORT_OF_MEMORY)
         kept = _states_in(bag)
         outcome.demand(kept >= sealed >= _ENOUGH, f"{kept} states in the bag, {sealed} were sealed")

@@ -21,8 +21,8 @@ import psutil
 import typer
 from rich.console import Console
 
-from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
+from pendulum_bags.experiments.orchestrator_node import Orchestrator, PlantClient, RecorderClient
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.experiments.session import (
     RECORDER_PRIORITY,
@@ -144,9 +144,9 @@ def soak(folder: Path, domain: int, minutes: float) -> SoakReport:
     logs = folder / "logs"
     with (
         ProcessSet(logs, ros_environment(domain, logs)) as processes,
-        Conductor(domain, watch=processes.check) as conductor,
+        Orchestrator(domain, watch=processes.check) as orchestrator,
     ):
-        recorders = _start(processes, conductor, folder)
+        recorders = _start(processes, orchestrator, folder)
         watched = {child.name: psutil.Process(child.process.pid) for child in processes.children}
         began = time.monotonic()
         while (elapsed := time.monotonic() - began) < duration:
@@ -156,7 +156,7 @@ def soak(folder: Path, domain: int, minutes: float) -> SoakReport:
                 footprint.resident.append(process.memory_info().rss)
                 footprint.descriptors.append(process.num_fds())
             report.load.append(os.getloadavg()[0] / (os.cpu_count() or 1))
-            conductor.spin(min(_SAMPLE_PERIOD, max(duration - elapsed, 0.0)))
+            orchestrator.spin(min(_SAMPLE_PERIOD, max(duration - elapsed, 0.0)))
         # Those who answer first, then the plants, then the recorders: every last word is heard.
         for child in reversed(processes.children.copy()):
             if child not in recorders:
@@ -171,7 +171,7 @@ def soak(folder: Path, domain: int, minutes: float) -> SoakReport:
     return report
 
 
-def _start(processes: ProcessSet, conductor: Conductor, folder: Path) -> list[Child]:
+def _start(processes: ProcessSet, orchestrator: Orchestrator, folder: Path) -> list[Child]:
     recorders = []
     for namespace in ("/sim", "/hw"):
         metadata = folder / f"metadata_{namespace[1:]}.json"
@@ -180,17 +180,17 @@ def _start(processes: ProcessSet, conductor: Conductor, folder: Path) -> list[Ch
         recorders.append(start_recorder(processes, bag, namespace, metadata, "mcap", priority=priority))
     for program in _programs():
         start_with_priority(processes, program)
-    plant = PlantClient(conductor, "/sim", "simulator", watch=False)
-    bridge = PlantClient(conductor, "/hw", "bridge")
+    plant = PlantClient(orchestrator, "/sim", "simulator", watch=False)
+    bridge = PlantClient(orchestrator, "/hw", "bridge")
     for namespace in ("/sim", "/hw"):
         wanted = [*(f"{namespace}/{name}" for name in names.SIGNALS), names.DIAGNOSTICS]
-        RecorderClient(conductor, namespace).wait_until_heard(wanted, _START_TIMEOUT)
-    conductor.wait_for(
+        RecorderClient(orchestrator, namespace).wait_until_heard(wanted, _START_TIMEOUT)
+    orchestrator.wait_for(
         "the plant to be heard",
-        lambda: conductor.node.count_subscribers(f"/sim/{names.JOINT_STATES}") >= _SIM_LISTENERS,
+        lambda: orchestrator.node.count_subscribers(f"/sim/{names.JOINT_STATES}") >= _SIM_LISTENERS,
         _START_TIMEOUT,
     )
-    conductor.spin(1.0)
+    orchestrator.spin(1.0)
     plant.resume(_START_TIMEOUT)
     bridge.wait_until_ready(_START_TIMEOUT)
     bridge.arm()

@@ -19,7 +19,7 @@ from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
 from pendulum_msgs_py.programs.options import RunningDomain
 
 if TYPE_CHECKING:
-    from pendulum_bags.experiments.conductor_node import PlantClient
+    from pendulum_bags.experiments.orchestrator_node import PlantClient
 
 __all__ = ["app", "main"]
 
@@ -58,24 +58,24 @@ def move(
     exit code is 2. A request that reached a plant which stands still acts when it goes on; the plant itself is in
     `fault` then, and arms only on request.
     """
-    from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
     from pendulum_bags.experiments.domain import check_domain
     from pendulum_bags.experiments.graph_plant import find_plant
+    from pendulum_bags.experiments.orchestrator_node import Orchestrator, PlantClient
 
     place = goal if goal in {*_STOPS, "upright", "down"} else _angle(goal)
-    with Conductor(check_domain(domain) or 0) as conductor:
+    with Orchestrator(check_domain(domain) or 0) as orchestrator:
         if place in _STOPS:
             service, said = _STOPS[str(place)]
             with _unless_confirmed(namespace) if place == "stop" else nullcontext():
-                node = find_plant(conductor, namespace)
-                PlantClient(conductor, namespace, node, watch=False).call(f"{node}/{service.removeprefix('~/')}")
+                node = find_plant(orchestrator, namespace)
+                PlantClient(orchestrator, namespace, node, watch=False).call(f"{node}/{service.removeprefix('~/')}")
             print(f"{namespace}: {said}", flush=True)
             return 0
-        node = find_plant(conductor, namespace)
-        plant = PlantClient(conductor, namespace, node)
+        node = find_plant(orchestrator, namespace)
+        plant = PlantClient(orchestrator, namespace, node)
         plant.wait_until_ready(_PATIENCE, controller=False, disturbance=False)
         # What is on the graph by then has been met: the plant's own services are no older.
-        conductor.spin(0.5)
+        orchestrator.spin(0.5)
         controlled = plant.has_controller()
         try:
             _move(plant, place, controlled=controlled, control=control)
@@ -141,7 +141,7 @@ def _move(plant: PlantClient, goal: str | float, *, controlled: bool, control: b
         plant.arm()
     print(f"{space}: moving from {where:.2f} to {end:.2f} rad in {duration:.0f} s, at most 0.3 rad/s", flush=True)
     plant.follow(ramp, "move" if isinstance(goal, float) else f"move_{goal}")
-    wait = plant.conductor.wait_for
+    wait = plant.orchestrator.wait_for
     wait(f"{space} to follow the ramp", plant.is_following, _PATIENCE)
     # An active controller would take over at the end; until now it may have held the pendulum.
     if controlled and plant.controller_is_active():
@@ -157,7 +157,7 @@ def _move(plant: PlantClient, goal: str | float, *, controlled: bool, control: b
     elif controlled and control:
         print(f"{space}: upright; activating the controller", flush=True)
         plant.switch_controller(on=True)
-        plant.conductor.spin(0.5)
+        plant.orchestrator.spin(0.5)
         if plant.newest_mode() != "armed_effort":
             raise FaultError(f"{space} is {plant.newest_mode()}; expected the controller to have taken over")
         print(f"{space}: the controller holds it", flush=True)

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import check_domain
 from pendulum_bags.experiments.lockstep import record_run
+from pendulum_bags.experiments.orchestrator_node import Orchestrator, PlantClient, RecorderClient
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.session import ANSWER_PRIORITY, START_TIMEOUT, conduct, refuse_existing, start_loop
 from pendulum_bags.runs.run_record import RUN_RECORD
@@ -144,12 +144,12 @@ def play_on_running_plant(
     refuse_existing(bag)
     logs = bag.parent / "logs" / bag.name
     with conduct(logs, check_domain(domain) or 0) as session:
-        conductor = session.conductor
-        node_name = _find_plant(conductor, namespace)
-        _refuse_others(conductor, namespace)
-        plant = PlantClient(conductor, namespace, node_name, controller="zero_torque", disturbance="excitation")
-        conductor.wait_for(f"a state of {namespace}", lambda: plant.sample is not None, _FIND_TIMEOUT)
-        _require_rest(conductor, plant)
+        orchestrator = session.orchestrator
+        node_name = _find_plant(orchestrator, namespace)
+        _refuse_others(orchestrator, namespace)
+        plant = PlantClient(orchestrator, namespace, node_name, controller="zero_torque", disturbance="excitation")
+        orchestrator.wait_for(f"a state of {namespace}", lambda: plant.sample is not None, _FIND_TIMEOUT)
+        _require_rest(orchestrator, plant)
         armed = _is_armed(plant, may_arm=arm)
         run = {"experiment": "excitation", "namespace": namespace, "plant": node_name, "clock": "realtime"}
         recorder = session.record(
@@ -165,14 +165,14 @@ def play_on_running_plant(
             start_loop(session.processes, replace(program, name=name), ANSWER_PRIORITY)
         plant.wait_until_ready(START_TIMEOUT)
         wanted = {f"{namespace}/{topic}" for topic in (names.JOINT_STATES, names.APPLIED_EFFORT, names.DISTURBANCE)}
-        RecorderClient(conductor, namespace).wait_until_heard(wanted, START_TIMEOUT)
+        RecorderClient(orchestrator, namespace).wait_until_heard(wanted, START_TIMEOUT)
         # Beyond its limits, or interrupted: release the drive now, not after the programs have ended.
         session.drives(plant)
         if not armed:
             plant.arm()
         plant.start_disturbance()
-        conductor.wait_for("the end of the excitation", lambda: _watch(plant, play), play.duration + START_TIMEOUT)
-        conductor.spin(_REST)
+        orchestrator.wait_for("the end of the excitation", lambda: _watch(plant, play), play.duration + START_TIMEOUT)
+        orchestrator.spin(_REST)
         if not armed:
             session.let_go()
         # The plant is its commander's again: an error of the bag must not disarm it.
@@ -181,28 +181,28 @@ def play_on_running_plant(
     return bag
 
 
-def _find_plant(conductor: Conductor, namespace: str) -> str:
+def _find_plant(orchestrator: Orchestrator, namespace: str) -> str:
     topic = f"{namespace}/{names.JOINT_STATES}"
-    node = conductor.node
+    node = orchestrator.node
     try:
-        conductor.wait_for("", lambda: node.count_publishers(topic) > 0, _FIND_TIMEOUT)
+        orchestrator.wait_for("", lambda: node.count_publishers(topic) > 0, _FIND_TIMEOUT)
     except FaultError:
         raise FaultError(
-            f"no plant publishes {topic} in ROS domain {conductor.domain}; expected one: start it, or use --on sim"
+            f"no plant publishes {topic} in ROS domain {orchestrator.domain}; expected one: start it, or use --on sim"
         ) from None
-    conductor.spin(1.0)  # discovery of other nodes takes a moment longer
+    orchestrator.spin(1.0)  # discovery of other nodes takes a moment longer
     found = sorted({info.node_name for info in node.get_publishers_info_by_topic(topic)})
     if len(found) != 1:
         raise FaultError(f"{topic} is published by {', '.join(found)}; expected one plant")
     return found[0]
 
 
-def _refuse_others(conductor: Conductor, namespace: str) -> None:
+def _refuse_others(orchestrator: Orchestrator, namespace: str) -> None:
     for name in (names.EFFORT_COMMAND, names.DISTURBANCE):
         topic = f"{namespace}/{name}"
         others = sorted(
             names.full_name(info.node_namespace, info.node_name)
-            for info in conductor.node.get_publishers_info_by_topic(topic)
+            for info in orchestrator.node.get_publishers_info_by_topic(topic)
         )
         if others:
             raise FaultError(
@@ -210,9 +210,9 @@ def _refuse_others(conductor: Conductor, namespace: str) -> None:
             )
 
 
-def _require_rest(conductor: Conductor, plant: PlantClient) -> None:
+def _require_rest(orchestrator: Orchestrator, plant: PlantClient) -> None:
     for _ in range(10):
-        conductor.spin(0.05)
+        orchestrator.spin(0.05)
         sample = plant.sample
         assert sample is not None
         angle = wrap(sample.position[0])

@@ -9,7 +9,7 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import FaultError, ParameterError
 
 if TYPE_CHECKING:
-    from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
+    from pendulum_bags.experiments.orchestrator_node import Orchestrator, PlantClient
 
 __all__ = ["PREFIX", "find_plant", "join", "running_namespace"]
 
@@ -34,7 +34,7 @@ def running_namespace(name: str) -> str | None:
     return namespace
 
 
-def find_plant(conductor: Conductor, namespace: str) -> str:
+def find_plant(orchestrator: Orchestrator, namespace: str) -> str:
     """Return the name of the node with an e-stop in a namespace, the plant; a FaultError if there is none."""
     space = namespace.rstrip("/")
 
@@ -42,28 +42,28 @@ def find_plant(conductor: Conductor, namespace: str) -> str:
         ends = f"/{names.E_STOP.removeprefix('~/')}"
         return [
             name.removeprefix(f"{space}/").removesuffix(ends)
-            for name, _ in conductor.node.get_service_names_and_types()
+            for name, _ in orchestrator.node.get_service_names_and_types()
             if name.startswith(f"{space}/") and name.endswith(ends)
         ]
 
-    return conductor.wait_for(f"a plant in {namespace}", found, _PATIENCE)[0]
+    return orchestrator.wait_for(f"a plant in {namespace}", found, _PATIENCE)[0]
 
 
-def join(conductor: Conductor, space: str) -> PlantClient:
+def join(orchestrator: Orchestrator, space: str) -> PlantClient:
     """Return a client of a running plant that is at rest and has no other commander; nothing is sent to it.
 
     A FaultError if there is none, or it has another commander, is armed, has other joints, or does not hang near 0.
     """
-    from pendulum_bags.experiments.conductor_node import PlantClient
+    from pendulum_bags.experiments.orchestrator_node import PlantClient
 
-    node = find_plant(conductor, space)
-    _refuse_others(conductor, space)
-    client = PlantClient(conductor, space, node)
+    node = find_plant(orchestrator, space)
+    _refuse_others(orchestrator, space)
+    client = PlantClient(orchestrator, space, node)
     client.wait_until_ready(_PATIENCE, controller=False, disturbance=False)
     # Discovery is complete by then: node information is no older than services.
-    conductor.spin(0.5)
+    orchestrator.spin(0.5)
     # The commander may be discovered later than the plant.
-    _refuse_others(conductor, space)
+    _refuse_others(orchestrator, space)
     if client.is_armed():
         raise FaultError(
             f"{space} is armed already; expected it at rest and disarmed (if no other program uses it: "
@@ -77,13 +77,13 @@ def join(conductor: Conductor, space: str) -> PlantClient:
     return client
 
 
-def _refuse_others(conductor: Conductor, space: str) -> None:
-    for name, namespace in conductor.node.get_node_names_and_namespaces():
+def _refuse_others(orchestrator: Orchestrator, space: str) -> None:
+    for name, namespace in orchestrator.node.get_node_names_and_namespaces():
         if namespace == space and name in _OURS:
             raise FaultError(f"{space}/{name} runs already, and this experiment starts its own; end that one first")
-    ours = [publisher.topic_name for publisher in conductor.node.publishers]
+    ours = [publisher.topic_name for publisher in orchestrator.node.publishers]
     for topic in _COMMANDS:
-        if count := conductor.node.count_publishers(f"{space}/{topic}") - ours.count(f"{space}/{topic}"):
+        if count := orchestrator.node.count_publishers(f"{space}/{topic}") - ours.count(f"{space}/{topic}"):
             raise FaultError(
                 f"{space}/{topic} has {count} publisher{'s' * (count > 1)}: somebody else commands this plant; "
                 "expected no other commander"

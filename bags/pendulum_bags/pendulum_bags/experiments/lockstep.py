@@ -6,10 +6,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.joint_run import JointSettings
+from pendulum_bags.experiments.orchestrator_node import Orchestrator, PlantClient, RecorderClient
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.session import (
     ANSWER_PRIORITY,
@@ -124,7 +124,7 @@ def record_run(
         answering = (spec.controller_program(), spec.disturbance_program())
         for node, priority in (*((each, ANSWER_PRIORITY) for each in answering), (program, PLANT_PRIORITY)):
             start_loop(session.processes, node, priority, simulated=simulated)
-        plant = PlantClient(session.conductor, namespace, program.node_name, watch=False)
+        plant = PlantClient(session.orchestrator, namespace, program.node_name, watch=False)
         session.wait_until_all_hear_each_other(namespace, _RUN_LISTENERS, clock=simulated)
         session.drives(plant)
         if not simulated:
@@ -136,27 +136,27 @@ def record_run(
         plant.watch()
         if not spec.has_bridge:
             plant.resume(START_TIMEOUT)
-        _wait_for_end(session.conductor, plant, spec.duration)
+        _wait_for_end(session.orchestrator, plant, spec.duration)
         session.close_in_lockstep(recorder, plant, spec.steps + 1, _TOLD_EACH_STEP)
     return bag
 
 
 def _keep_time(session: Session, plant: PlantClient, spec: RunSpec) -> None:
-    conductor = session.conductor
+    orchestrator = session.orchestrator
     plant.watch()
     if spec.has_bridge:
         plant.arm(START_TIMEOUT)
     else:
         plant.resume(START_TIMEOUT)
-    conductor.wait_for("states", lambda: plant.sample is not None, START_TIMEOUT)
+    orchestrator.wait_for("states", lambda: plant.sample is not None, START_TIMEOUT)
     assert plant.sample is not None
     plant.mark(START_EVENT)
     end_ns = plant.sample.stamp_ns + round(spec.duration * NANOSECONDS)
-    conductor.wait_for(
+    orchestrator.wait_for(
         f"{spec.duration:g} s of real time", lambda: _has_reached(plant, end_ns), START_TIMEOUT + spec.duration
     )
     plant.mark(END_EVENT)
-    conductor.spin(_LAST_WORDS)
+    orchestrator.spin(_LAST_WORDS)
     session.let_go()
 
 
@@ -165,15 +165,15 @@ def _has_reached(plant: PlantClient, end_ns: int) -> bool:
     return plant.sample is not None and plant.sample.stamp_ns >= end_ns
 
 
-def _wait_for_end(conductor: Conductor, plant: PlantClient, duration: float) -> None:
+def _wait_for_end(orchestrator: Orchestrator, plant: PlantClient, duration: float) -> None:
     """Wait for the end of a run in lockstep, on a busy machine too, as long as it progresses."""
-    conductor.wait_for("the first state", lambda: plant.is_heard or _is_finished(plant), START_TIMEOUT)
+    orchestrator.wait_for("the first state", lambda: plant.is_heard or _is_finished(plant), START_TIMEOUT)
     plant.look_away()
-    recorder, received = RecorderClient(conductor, plant.namespace), 0
+    recorder, received = RecorderClient(orchestrator, plant.namespace), 0
     states = f"{plant.namespace}/{names.JOINT_STATES}"
     while not _is_finished(plant):
         ends = time.monotonic() + _PATIENCE
-        conductor.wait_for(
+        orchestrator.wait_for(
             f"the end of a run of {duration:g} s of simulated time",
             lambda ends=ends: _is_finished(plant) or time.monotonic() >= ends,  # type: ignore[misc]
             2.0 * _PATIENCE,

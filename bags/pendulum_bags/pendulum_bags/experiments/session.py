@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.host_pool import HostPool
+from pendulum_bags.experiments.orchestrator_node import Orchestrator, PlantClient, RecorderClient
 from pendulum_bags.experiments.processes import Child, ProcessSet, ros_environment, start_recorder
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.contract import names
@@ -51,7 +51,7 @@ class Session:
     """The programs of one run and their orchestrator; made by :func:`conduct`."""
 
     processes: ProcessSet
-    conductor: Conductor
+    orchestrator: Orchestrator
     logs: Path
     _driven: list[PlantClient] = field(default_factory=list)
 
@@ -81,7 +81,7 @@ class Session:
         # The clock ticks once for each state, and no topic waits for another.
         expected = {f"{plant.namespace}/{names.JOINT_STATES}": states, names.CLOCK: states}
         expected |= {f"{plant.namespace}/{topic}": states - 1 for topic in steps_are_told_on}
-        RecorderClient(self.conductor, plant.namespace).wait_for_all(expected)
+        RecorderClient(self.orchestrator, plant.namespace).wait_for_all(expected)
         self.close(recorder)
 
     def drives(self, *plants: PlantClient) -> None:
@@ -105,7 +105,7 @@ class Session:
         ``listeners`` are the required subscriptions to each of the plant's topics, by relative name; ``clock`` if the
         plant publishes simulated time, which is recorded too.
         """
-        conductor, node = self.conductor, self.conductor.node
+        orchestrator, node = self.orchestrator, self.orchestrator.node
 
         def complete() -> bool:
             return all(
@@ -114,12 +114,12 @@ class Session:
                 for topic, count in listeners.items()
             )
 
-        conductor.wait_for("all nodes to hear each other", complete, START_TIMEOUT)
+        orchestrator.wait_for("all nodes to hear each other", complete, START_TIMEOUT)
         recorded = {f"{namespace}/{topic}" for topic, count in listeners.items() if count}
         recorded |= {names.CLOCK} if clock else set()
-        RecorderClient(conductor, namespace).wait_until_heard(recorded, START_TIMEOUT)
+        RecorderClient(orchestrator, namespace).wait_until_heard(recorded, START_TIMEOUT)
         # The two ends of a match complete it a moment apart.
-        conductor.spin(0.5)
+        orchestrator.spin(0.5)
 
 
 @contextmanager
@@ -136,9 +136,9 @@ def conduct(
     """
     with (
         ProcessSet(logs, ros_environment(domain, logs), hosts) as processes,
-        Conductor(domain, watch=processes.check, on_wait=on_wait) as conductor,
+        Orchestrator(domain, watch=processes.check, on_wait=on_wait) as orchestrator,
     ):
-        session = Session(processes, conductor, logs)
+        session = Session(processes, orchestrator, logs)
         try:
             yield session
         except BaseException:

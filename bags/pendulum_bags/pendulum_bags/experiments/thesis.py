@@ -8,10 +8,10 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from pendulum_bags.experiments.conductor_node import Conductor, PlantClient, RecorderClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.graph_plant import join
 from pendulum_bags.experiments.lockstep import lockstep_spec
+from pendulum_bags.experiments.orchestrator_node import Orchestrator, PlantClient, RecorderClient
 from pendulum_bags.experiments.processes import Child
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.repeats import record_simulation
@@ -66,7 +66,7 @@ def run_thesis(
     with ExitStack() as stack:
         session = stack.enter_context(conduct(folder / "logs", stack.enter_context(reserve_domain(domain))))
         progress.phase("starting", 6.0)
-        _refuse_occupied_domain(session.conductor, settings)
+        _refuse_occupied_domain(session.orchestrator, settings)
         plants, recorders = _start(session, folder, settings)
         session.drives(*plants)
         _regulate(session, plants, settings, progress, on_idle, rests)
@@ -86,8 +86,8 @@ def _start(
     session: Session, folder: Path, settings: RegulationSettings
 ) -> tuple[tuple[PlantClient, PlantClient], list[Child]]:
     """Start all programs; return both plants, and their recorders. Running plants are checked without commands."""
-    conductor = session.conductor
-    joined = {side: join(conductor, running) for side in SIDES if (running := settings.running(side)) is not None}
+    orchestrator = session.orchestrator
+    joined = {side: join(orchestrator, running) for side in SIDES if (running := settings.running(side)) is not None}
     recorders = []
     for side in SIDES:
         namespace, plant = settings.namespace(side), settings.plant_name(side)
@@ -107,7 +107,7 @@ def _start(
     for program in others:
         start_loop(session.processes, program, ANSWER_PRIORITY)
     sim, hw = (
-        joined[side] if program is None else PlantClient(conductor, settings.namespace(side), program.node_name)
+        joined[side] if program is None else PlantClient(orchestrator, settings.namespace(side), program.node_name)
         for side, program in programs.items()
     )
     return (sim, hw), recorders
@@ -121,48 +121,48 @@ def _regulate(
     on_idle: Callable[[], None],
     rests: Callable[[], bool],
 ) -> None:
-    conductor, noise = session.conductor, settings.noise
+    orchestrator, noise = session.orchestrator, settings.noise
     for plant in plants:
         plant.wait_until_ready(START_TIMEOUT)
         recorded = [f"{plant.namespace}/{topic}" for topic in (*names.SIGNALS, names.JOINT_TRAJECTORY)]
-        RecorderClient(conductor, plant.namespace).wait_until_heard(recorded, START_TIMEOUT)
+        RecorderClient(orchestrator, plant.namespace).wait_until_heard(recorded, START_TIMEOUT)
         plant.wait_until_moves_are_recorded(START_TIMEOUT)
     for plant in plants:
         plant.configure_controller()
         plant.arm()
 
-    durations = _start_move(conductor, plants, settings, UPRIGHT, "ramp_up", progress)
+    durations = _start_move(orchestrator, plants, settings, UPRIGHT, "ramp_up", progress)
     on_idle()
-    conductor.spin(max(0.0, max(durations) - _PAUSING))
+    orchestrator.spin(max(0.0, max(durations) - _PAUSING))
     rests()
-    _wait_for_goal(conductor, plants, durations)
+    _wait_for_goal(orchestrator, plants, durations)
     # Upright, the plants hold their positions meanwhile.
-    conductor.wait_for("other recordings to pause", rests, START_TIMEOUT)
+    orchestrator.wait_for("other recordings to pause", rests, START_TIMEOUT)
 
     progress.phase("regulation", SETTLE_TIME)
     for plant in plants:
         plant.mark("regulation")
         plant.switch_controller(on=True)
-    conductor.spin(SETTLE_TIME)
+    orchestrator.spin(SETTLE_TIME)
 
     progress.phase("noise", noise.duration)
     started = [plant.start_disturbance() for plant in plants]
-    conductor.wait_for("the disturbances to start", lambda: all(future.done() for future in started), 5.0)
+    orchestrator.wait_for("the disturbances to start", lambda: all(future.done() for future in started), 5.0)
     for plant in plants:
-        conductor.wait_for(
+        orchestrator.wait_for(
             f"the end of the noise on {plant.namespace}", partial(_noise_ended, plant), noise.duration + 15.0
         )
 
-    durations = _start_move(conductor, plants, settings, 0.0, "ramp_down", progress)
+    durations = _start_move(orchestrator, plants, settings, 0.0, "ramp_down", progress)
     on_idle()
     # Before the ramp ends: an active controller would take over a pendulum half a turn from upright.
     for plant in plants:
         plant.switch_controller(on=False)
-    _wait_for_goal(conductor, plants, durations)
+    _wait_for_goal(orchestrator, plants, durations)
     for plant in plants:
         plant.disarm()
         plant.mark("done")
-    conductor.spin(0.2)
+    orchestrator.spin(0.2)
 
 
 def _noise_ended(plant: PlantClient) -> bool:
@@ -180,7 +180,7 @@ def _simulate_own_protocol(folder: Path, settings: RegulationSettings) -> None:
 
 
 def _start_move(
-    conductor: Conductor,
+    orchestrator: Orchestrator,
     plants: Sequence[PlantClient],
     settings: RegulationSettings,
     goal: float,
@@ -195,21 +195,21 @@ def _start_move(
     for plant, ramp in zip(plants, ramps, strict=True):
         plant.follow(ramp, phase, goal=goal)
     for plant in plants:
-        conductor.wait_for(f"{plant.namespace} to follow the {phase.replace('_', ' ')}", plant.is_following, 5.0)
+        orchestrator.wait_for(f"{plant.namespace} to follow the {phase.replace('_', ' ')}", plant.is_following, 5.0)
     return [ramp.duration for ramp in ramps]
 
 
-def _wait_for_goal(conductor: Conductor, plants: Sequence[PlantClient], durations: Sequence[float]) -> None:
+def _wait_for_goal(orchestrator: Orchestrator, plants: Sequence[PlantClient], durations: Sequence[float]) -> None:
     for plant, duration in zip(plants, durations, strict=True):
-        conductor.wait_for(f"{plant.namespace} to end its move", plant.trajectory_finished, duration + 15.0)
+        orchestrator.wait_for(f"{plant.namespace} to end its move", plant.trajectory_finished, duration + 15.0)
 
 
-def _refuse_occupied_domain(conductor: Conductor, settings: RegulationSettings) -> None:
+def _refuse_occupied_domain(orchestrator: Orchestrator, settings: RegulationSettings) -> None:
     ours = {settings.namespace(side) for side in SIDES if settings.running(side) is None}
-    conductor.spin(0.5)
-    for name, namespace in conductor.node.get_node_names_and_namespaces():
+    orchestrator.spin(0.5)
+    for name, namespace in orchestrator.node.get_node_names_and_namespaces():
         if namespace in ours:
             raise FaultError(
-                f"ROS domain {conductor.domain} is in use: {namespace}/{name} is already there; "
+                f"ROS domain {orchestrator.domain} is in use: {namespace}/{name} is already there; "
                 "choose another with --domain"
             )

@@ -7,10 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from pendulum_bags.experiments.conductor_node import PlantClient
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.host_pool import HostPool, open_pool
 from pendulum_bags.experiments.operator import RealMachine, real_machine
+from pendulum_bags.experiments.orchestrator_node import PlantClient
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.run_spec import EMULATOR_PATIENCE, lockstep_parameters
 from pendulum_bags.experiments.session import ANSWER_PRIORITY, PLANT_PRIORITY, START_TIMEOUT, conduct, start_loop
@@ -183,11 +183,11 @@ def _run_trial(
     bag = folder / f"trial_{trial}"
     lockstep = settings.lockstep
     with conduct(folder / "logs" / bag.name, domain, hosts=hosts) as session:
-        conductor = session.conductor
+        orchestrator = session.orchestrator
         recorder = session.record(bag, "/hw", _metadata(settings, trial), settings.storage, simulated=lockstep)
         start_loop(session.processes, settings.procedure_program(trial), ANSWER_PRIORITY, simulated=lockstep)
         start_loop(session.processes, settings.plant_program(trial, bag), PLANT_PRIORITY, simulated=lockstep)
-        plant = PlantClient(conductor, "/hw", "bridge", watch=not lockstep)
+        plant = PlantClient(orchestrator, "/hw", "bridge", watch=not lockstep)
         session.drives(plant)
         session.wait_until_all_hear_each_other("/hw", _topics(settings), clock=lockstep)
         if settings.by_person:
@@ -201,13 +201,13 @@ def _run_trial(
             ask("Turn it slowly to half a turn and back, in 10 to 20 s; then press Enter.")
             plant.call("procedure/finish")
         longest = _LONGEST_BY_HAND if settings.by_person else START_TIMEOUT + _SLOWEST * settings.expected_duration
-        conductor.wait_for(f"the end of trial {trial}", lambda: _has_ended(plant, lockstep=lockstep), longest)
+        orchestrator.wait_for(f"the end of trial {trial}", lambda: _has_ended(plant, lockstep=lockstep), longest)
         if lockstep:
             finished = plant.newest_event(Event.LOCKSTEP_FINISHED)
             assert finished is not None
             session.close_in_lockstep(recorder, plant, 1 + int(finished["steps"]), [names.APPLIED_EFFORT])
         session.let_go()
-        conductor.spin(0.2)
+        orchestrator.spin(0.2)
     return bag
 
 

@@ -33,7 +33,7 @@ from pendulum_msgs_py.ros.leaving import leaving_graph
 from pendulum_msgs_py.ros.middleware import check_closed, set_middleware_defaults
 from pendulum_msgs_py.ros.polled import PolledInput, PollingNode
 
-__all__ = ["Conductor", "PlantClient", "RecorderClient"]
+__all__ = ["Orchestrator", "PlantClient", "RecorderClient"]
 
 _SLICE = 0.05
 _QUIET_POLLS = 3
@@ -44,7 +44,7 @@ _MATCHING = 1.0
 _T = TypeVar("_T")
 
 
-class Conductor:
+class Orchestrator:
     """An rclpy context and node, spun only while waiting; Ctrl-C ends any wait at once.
 
     Waiting and calling raise FaultError on a timeout.
@@ -67,7 +67,7 @@ class Conductor:
         self.listened = 0.0
         self.after_listening: list[Callable[[], None]] = []
 
-    def __enter__(self) -> Conductor:
+    def __enter__(self) -> Orchestrator:
         """Join the graph."""
         set_middleware_defaults()
         self.context = Context()
@@ -147,7 +147,7 @@ class PlantClient:
 
     def __init__(
         self,
-        conductor: Conductor,
+        orchestrator: Orchestrator,
         namespace: str,
         plant: str,
         *,
@@ -155,13 +155,13 @@ class PlantClient:
         disturbance: str = "disturbance",
         watch: bool = True,
     ) -> None:
-        node = conductor.node
-        self.conductor = conductor
+        node = orchestrator.node
+        self.orchestrator = orchestrator
         # Names in the root namespace begin with one slash, too.
         self.namespace = namespace = namespace.rstrip("/")
         self.sample: JointSample | None = None
         self._foreign_joints: tuple[str, ...] = ()
-        self._heard = conductor.listened
+        self._heard = orchestrator.listened
         self.events: list[dict[str, Any]] = []
         self._arm = node.create_client(SetBool, f"{namespace}/{plant}/arm")
         self._pause = node.create_client(SetBool, f"{namespace}/{plant}/pause")
@@ -185,16 +185,16 @@ class PlantClient:
 
     def watch(self) -> None:
         """Subscribe to the plant's states and poll the newest, without a callback for each."""
-        self._watching = self.conductor.node.create_polled_input(
+        self._watching = self.orchestrator.node.create_polled_input(
             JointState, f"{self.namespace}/{names.JOINT_STATES}", qos.NEWEST_STATE
         )
-        self.conductor.after_listening.append(self._look)
+        self.orchestrator.after_listening.append(self._look)
 
     def look_away(self) -> None:
         """Unsubscribe from its states: receiving them costs a tenth of a run in lockstep."""
         if self._watching is not None:
-            self.conductor.after_listening.remove(self._look)
-            self.conductor.node.destroy_polled_input(self._watching)
+            self.orchestrator.after_listening.remove(self._look)
+            self.orchestrator.node.destroy_polled_input(self._watching)
             self._watching = None
 
     def _look(self) -> None:
@@ -203,13 +203,13 @@ class PlantClient:
 
     def wait_until_ready(self, timeout: float, *, controller: bool = True, disturbance: bool = True) -> None:
         """Wait until states of the right joints arrive and all services and the trajectory topic are there."""
-        wait = self.conductor.wait_for
+        wait = self.orchestrator.wait_for
         wait(f"states on {self.namespace}/{names.JOINT_STATES}", self._has_state, timeout)
         clients = [self._arm, self._e_stop]
         clients += [self._change_state] if controller else []
         clients += [self._start] if disturbance else []
         for client in clients:
-            self.conductor.wait_for_service(client, timeout)
+            self.orchestrator.wait_for_service(client, timeout)
         wait(
             f"a plant on {self.namespace}/{names.JOINT_TRAJECTORY}",
             lambda: self._trajectory.get_subscription_count() > 0,
@@ -218,18 +218,18 @@ class PlantClient:
 
     def wait_until_moves_are_recorded(self, timeout: float) -> None:
         """Wait until a recorder is matched with the trajectory publisher, at both ends, at most ``timeout`` [s]."""
-        topic, node = f"{self.namespace}/{names.JOINT_TRAJECTORY}", self.conductor.node
+        topic, node = f"{self.namespace}/{names.JOINT_TRAJECTORY}", self.orchestrator.node
 
         def listeners() -> list[tuple[str, str]]:
             return [(each.node_namespace, each.node_name) for each in node.get_subscriptions_info_by_topic(topic)]
 
-        self.conductor.wait_for(
+        self.orchestrator.wait_for(
             f"a recorder on {topic}", lambda: (self.namespace or "/", names.RECORDER) in listeners(), timeout
         )
         # Some never match: those that request old moves, or a deadline. The others match within moments.
         deadline = time.monotonic() + _MATCHING
         while self._trajectory.get_subscription_count() < len(listeners()) and time.monotonic() < deadline:
-            self.conductor.spin(_SLICE)
+            self.orchestrator.spin(_SLICE)
 
     def _has_state(self) -> bool:
         if self.sample is None and self._foreign_joints:
@@ -242,24 +242,24 @@ class PlantClient:
 
     def arm(self, timeout: float = 10.0) -> None:
         """Arm the plant; a bridge offers the service before it is connected, so ``timeout`` [s] may be long."""
-        response = self.conductor.call(self._arm, SetBool.Request(data=True), f"{self.namespace} to arm", timeout)
+        response = self.orchestrator.call(self._arm, SetBool.Request(data=True), f"{self.namespace} to arm", timeout)
         if not response.success:
             raise FaultError(f"{self.namespace} does not arm: {response.message}")
 
     def disarm(self) -> None:
         """Disarm the plant."""
-        self.conductor.call(self._arm, SetBool.Request(data=False), f"{self.namespace} to disarm")
+        self.orchestrator.call(self._arm, SetBool.Request(data=False), f"{self.namespace} to disarm")
 
     def call(self, service: str) -> None:
         """Call a Trigger service of another node in the plant's namespace, such as ``procedure/start``."""
-        client = self.conductor.node.create_client(Trigger, f"{self.namespace}/{service}")
-        response = self.conductor.call(client, Trigger.Request(), f"{self.namespace}/{service}")
+        client = self.orchestrator.node.create_client(Trigger, f"{self.namespace}/{service}")
+        response = self.orchestrator.call(client, Trigger.Request(), f"{self.namespace}/{service}")
         if not response.success:
             raise FaultError(f"{self.namespace}/{service} refuses: {response.message}")
 
     def resume(self, timeout: float) -> None:
         """Resume a paused plant."""
-        self.conductor.call(self._pause, SetBool.Request(data=False), f"{self.namespace} to go on", timeout)
+        self.orchestrator.call(self._pause, SetBool.Request(data=False), f"{self.namespace} to go on", timeout)
 
     def disarm_quietly(self) -> None:
         """Disarm on the way out; a plant without response must not prevent others from being disarmed."""
@@ -268,7 +268,7 @@ class PlantClient:
         future = self._arm.call_async(SetBool.Request(data=False))
         deadline = time.monotonic() + 1.0
         while not future.done() and time.monotonic() < deadline:
-            self.conductor.listen(_SLICE)
+            self.orchestrator.listen(_SLICE)
 
     def follow(self, trajectory: Trajectory, phase: str, **details: Any) -> None:
         """Start a move under position control, and record it as a phase."""
@@ -314,7 +314,7 @@ class PlantClient:
 
     def _transition(self, transition: int, what: str) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))
-        if not self.conductor.call(self._change_state, request, f"{self.namespace} controller to {what}").success:
+        if not self.orchestrator.call(self._change_state, request, f"{self.namespace} controller to {what}").success:
             raise FaultError(f"{self.namespace} controller does not {what}; its log says why")
 
     def start_disturbance(self) -> Future:
@@ -345,7 +345,7 @@ class PlantClient:
 
     def controller_is_active(self) -> bool:
         """Query the controller's lifecycle."""
-        state = self.conductor.call(self._get_state, GetState.Request(), f"{self.namespace} controller's state")
+        state = self.orchestrator.call(self._get_state, GetState.Request(), f"{self.namespace} controller's state")
         return bool(state.current_state.id == State.PRIMARY_STATE_ACTIVE)
 
     def check_mode(self) -> None:
@@ -356,7 +356,7 @@ class PlantClient:
 
     def check_alive(self) -> None:
         """Raise a FaultError if a plant in real time is silent: one that runs already can end without notice."""
-        silent = self.conductor.listened - self._heard
+        silent = self.orchestrator.listened - self._heard
         if silent > _SILENCE:
             raise FaultError(
                 f"{self.namespace} has sent no state for {silent:.0f} s: its program has ended or hangs. If it moves "
@@ -377,15 +377,15 @@ class PlantClient:
             self._foreign_joints = stamp_of_state(data, (names.JOINT,))[1]
         else:
             self.sample = sample
-            self._heard = self.conductor.listened
+            self._heard = self.orchestrator.listened
 
 
 class RecorderClient:
     """The recorder of the plant in a namespace."""
 
-    def __init__(self, conductor: Conductor, namespace: str) -> None:
-        self._conductor = conductor
-        self._status = conductor.node.create_client(Trigger, f"{namespace}/recorder/status")
+    def __init__(self, orchestrator: Orchestrator, namespace: str) -> None:
+        self._orchestrator = orchestrator
+        self._status = orchestrator.node.create_client(Trigger, f"{namespace}/recorder/status")
 
     def heard(self) -> set[str]:
         """Return the topics whose publishers the recorder is matched with."""
@@ -400,7 +400,7 @@ class RecorderClient:
                 raise FaultError(
                     f"the recorder has met no publisher of {unheard} in {timeout:g} s; expected one of each topic"
                 )
-            self._conductor.spin(_SLICE)
+            self._orchestrator.spin(_SLICE)
 
     def received(self, topic: str) -> int:
         """Return how many messages of a topic it has."""
@@ -418,7 +418,7 @@ class RecorderClient:
                     f"the recorder has {counts.get(behind, 0)} of {expected[behind]} messages of {behind} after "
                     f"{timeout:g} s"
                 )
-            self._conductor.spin(_SLICE)
+            self._orchestrator.spin(_SLICE)
             before, counts = counts, self._counts()
             quiet = quiet + 1 if counts == before else 0
 
@@ -426,6 +426,6 @@ class RecorderClient:
         return {name: entry["received"] for name, entry in self._ask().get("topics", {}).items()}
 
     def _ask(self) -> dict[str, Any]:
-        response = self._conductor.call(self._status, Trigger.Request(), "the recorder's status", 30.0)
+        response = self._orchestrator.call(self._status, Trigger.Request(), "the recorder's status", 30.0)
         status: dict[str, Any] = json.loads(response.message)
         return status

@@ -14,7 +14,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_msgs.msg import String
 from trajectory_msgs.msg import JointTrajectory
 
-from pendulum_bags.experiments.conductor_node import Conductor, PlantClient
+from pendulum_bags.experiments.orchestrator_node import Orchestrator, PlantClient
 from pendulum_msgs_py.contract.drive import Mode
 from pendulum_msgs_py.contract.names import RECORDER, Event
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
@@ -67,11 +67,11 @@ def _listener(
 def test_a_move_is_asked_for_when_it_reaches_the_recorder_too(domain_id: int) -> None:
     seen: list[JointTrajectory] = []
     recorded: list[JointTrajectory] = []
-    with Conductor(domain_id) as conductor:
-        plant = PlantClient(conductor, "/hw", "plant", watch=False)
+    with Orchestrator(domain_id) as orchestrator:
+        plant = PlantClient(orchestrator, "/hw", "plant", watch=False)
         with _listener(domain_id, "plant", seen):
             # Who listens is not who records.
-            conductor.wait_for("the plant", lambda: plant._trajectory.get_subscription_count() == 1, 10.0)
+            orchestrator.wait_for("the plant", lambda: plant._trajectory.get_subscription_count() == 1, 10.0)
             with pytest.raises(FaultError, match="recorder on /hw/joint_trajectory"):
                 plant.wait_until_moves_are_recorded(0.2)
             # Who asks for old moves gets none at all, and keeps nobody waiting for long.
@@ -79,4 +79,4 @@ def test_a_move_is_asked_for_when_it_reaches_the_recorder_too(domain_id: int) ->
             with _listener(domain_id, "late", [], wants_old), _listener(domain_id, RECORDER, recorded):
                 plant.wait_until_moves_are_recorded(10.0)
                 plant.follow(thesis_ramp(0.0, 0.1), "ramp_up")
-                conductor.wait_for("the move to arrive", lambda: seen and recorded, 10.0)
+                orchestrator.wait_for("the move to arrive", lambda: seen and recorded, 10.0)
