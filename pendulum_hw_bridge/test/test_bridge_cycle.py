@@ -281,7 +281,7 @@ def test_before_preparing_a_pending_stop_is_asked_for_once_more() -> None:
     assert rig.bridge.prepare() == ""
 
 
-def test_closing_disarms_releases_and_lets_go_whatever_fails() -> None:
+def test_closing_disarms_and_releases_whatever_fails() -> None:
     rig = Rig().armed()
     rig.port.fails["close"] = ActuatorError("module_lost", "gone")
     rig.bridge.close()

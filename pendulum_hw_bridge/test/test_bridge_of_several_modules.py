@@ -230,7 +230,7 @@ def test_all_are_released_whatever_one_of_them_raises_and_are_asked_again(broken
     assert not rig.bridge.stop_pending
 
 
-def test_closing_lets_go_of_all_whatever_one_of_them_raises() -> None:
+def test_closing_releases_all_even_if_one_of_them_raises() -> None:
     rig = Rig().armed()
     rig.ports[0].fails["close"] = RuntimeError("broken")
     rig.bridge.close()

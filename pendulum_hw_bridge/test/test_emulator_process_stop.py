@@ -61,7 +61,7 @@ def port(server: Server, monkeypatch: pytest.MonkeyPatch) -> Iterator[EmulatorPr
     backend = EmulatorProcessBackend("{}:{}".format(*server.address))
     backend.connect()
     yield backend
-    backend.let_go()
+    backend.release()
 
 
 def impatient(call: Callable[[], object], fault: str) -> None:

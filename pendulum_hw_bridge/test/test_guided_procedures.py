@@ -410,7 +410,7 @@ def test_a_machine_that_does_not_stand_a_proof_loses_an_older_one_and_a_person_t
 
 
 @pytest.mark.parametrize("way", ["done", "failed", "left", "not connected"])
-def test_the_module_is_let_go_of_on_every_way_out_of_a_step(
+def test_the_module_is_released_on_every_way_out_of_a_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, way: str
 ) -> None:
     lab = tmp_path / "lab.yaml"

@@ -467,7 +467,7 @@ def test_setpoints_that_were_kept_do_not_outlive_the_connection_and_a_new_one_is
     rig.shared.keep(1, Command(pwm=0.25))
     rig.shared._stop_told = {0}
     for port in (first, second):
-        port.let_go()  # type: ignore[attr-defined]
+        port.release()  # type: ignore[attr-defined]
     for port in (first, second):
         port.connect()
     rig.forget()

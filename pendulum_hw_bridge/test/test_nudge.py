@@ -63,7 +63,7 @@ def test_a_turn_is_measured_from_where_the_link_was_and_waited_for_half_a_minute
     assert (port.now_ns() - begin_ns) / 1e9 == pytest.approx(30.0, abs=0.1)
 
 
-def test_a_person_is_asked_for_one_way_and_lets_go_of_a_module_that_has_gone() -> None:
+def test_a_person_is_asked_for_one_way_and_releases_a_module_that_has_gone() -> None:
     said: list[str] = []
     port = Scripted(always(None))
     with pytest.raises(ActuatorError, match="no feedback for 1 s"):
@@ -75,7 +75,7 @@ def test_a_person_is_asked_for_one_way_and_lets_go_of_a_module_that_has_gone() -
     assert "a little CLOCKWISE as you look at it" in said[-1]
 
 
-def test_an_emulated_hand_pushes_one_way_and_lets_go() -> None:
+def test_an_emulated_hand_pushes_one_way_and_releases() -> None:
     port = EmulatorBackend(EmulatedX5(load_emulator("thesis"), seed=1), SteppedClock())
     pushed: list[float] = []
     port.push = pushed.append  # type: ignore[method-assign]

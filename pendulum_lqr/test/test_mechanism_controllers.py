@@ -77,7 +77,7 @@ def test_an_lqr_that_asks_for_too_much_catches_no_state_and_is_refused() -> None
         make_mechanism_catch(load_mechanism("acrobot"), (100.0, 100.0, 1.0, 1.0), 0.01)
 
 
-def test_the_catch_takes_over_within_its_region_where_it_catches_and_lets_go_beyond_twice_that() -> None:
+def test_the_catch_takes_over_within_its_region_and_releases_beyond_twice_that() -> None:
     plant = load_mechanism("pendubot_frictionless")
     catch = make_mechanism_catch(plant, Q, R)
     assert "not proven" in catch.region.describe()

@@ -220,7 +220,7 @@ class Day:
 
     def close(self) -> None:
         """Let go of the machine."""
-        self.truth.let_go()
+        self.truth.release()
 
 
 def _free_ports() -> tuple[int, int]:

@@ -92,7 +92,7 @@ def strategy_of(address: str) -> int:
     try:
         return int(port.connect().strategy)
     finally:
-        port.let_go()
+        port.release()
 
 
 def test_two_modules_are_held_as_one_plant_and_the_loss_of_one_switches_the_other_off(processes, peer: Peer) -> None:

@@ -86,13 +86,13 @@ def test_a_plant_drives_only_while_the_switch_is_held(
         refused = operator.arm()
         assert refused.message == "enable switch is not held; expected true on enable_input, all the time"
 
-        for let_go in (operator.fall_silent, lambda: operator.switch.publish(Bool(data=False))):
+        for release in (operator.fall_silent, lambda: operator.switch.publish(Bool(data=False))):
             operator.hold()
             operator.until(lambda: operator.arm().success, "a switch that is held")
             operator.until(operator.drives, "torque")
-            if let_go != operator.fall_silent:
+            if release != operator.fall_silent:
                 operator.fall_silent()
-            let_go()
+            release()
             operator.until(lambda: operator.mode() == "disarmed", "the end of driving")
             assert "enable switch is" in operator.diagnostics["reason"]
             operator.until(lambda: operator.applied[-1][1] == 0.0, "zero torque")

@@ -73,7 +73,7 @@ def test_a_program_that_does_not_end_in_time_is_named_with_its_output(tmp_path: 
     assert str(caught.value) == "repeat_1 still runs after 0.3 s; its last output: simulating"
 
 
-def test_a_program_that_stands_still_is_let_go_on_to_end_by_itself(tmp_path: Path) -> None:
+def test_a_stopped_program_continues_to_end_by_itself(tmp_path: Path) -> None:
     program = "import signal, sys; print('up', flush=True); signal.sigwait([signal.SIGINT]); sys.exit(3)"
     guarded = f"import signal; signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT]); {program}"
     with ProcessSet(tmp_path, {}) as processes:

@@ -62,7 +62,7 @@ def test_the_integrator_is_of_second_order():
     np.testing.assert_allclose(slopes, -2.0, atol=0.15)
 
 
-def test_dry_friction_holds_at_rest_and_lets_go_at_its_level():
+def test_dry_friction_holds_at_rest_and_yields_at_its_level():
     time = np.arange(0.0, 2.0, 0.01)
     effort = 0.1 * time
     recording = Recording(time, np.zeros_like(time), None, effort, hold="linear")

@@ -167,9 +167,9 @@ class EmulatorProcessBackend:
         try:
             self.stop()
         finally:
-            self.let_go()
+            self.release()
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """Release without stopping, for callers that only listened while another may be driving."""
         if self._socket is not None:
             self._socket.close()

@@ -68,7 +68,7 @@ class EmulatedLookup:
             else:
                 entries.append(self._seen[where])
             finally:
-                port.let_go()
+                port.release()
         return entries
 
     def get_group_from_macs(self, addresses: list[str], timeout_ms: float) -> EmulatedGroup | EmulatedGroups | None:
@@ -94,7 +94,7 @@ class EmulatedGroup:
 
     def __del__(self) -> None:
         if "_port" in self.__dict__:
-            self._port.let_go()
+            self._port.release()
 
     @property
     def command_lifetime(self) -> int:

@@ -355,7 +355,7 @@ class _GroupPort(HebiBackend):
         """Return this module's part of the newest frame if it is new; only the first joint waits for one."""
         return super().read(timeout if self._index == 0 else 0.0)
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """Release the group without stopping."""
         if self._group is not None:
             self._group = self._command = self._feedback = None
@@ -392,7 +392,7 @@ class GroupDrive(_GroupPort):
         try:
             self.stop()
         finally:
-            self.let_go()
+            self.release()
 
 
 class GroupEncoder:
@@ -420,4 +420,4 @@ class GroupEncoder:
 
     def close(self) -> None:
         """Release the group."""
-        self._port.let_go()
+        self._port.release()

@@ -142,7 +142,7 @@ def emulator_hand(
         hand.end()
         # A reply to a later request proves that the hand has released.
         backend.status()
-        backend.let_go()
+        backend.release()
     print(f"turned by {turned:+.2f} rad, and let go")
 
 

@@ -97,7 +97,7 @@ def _modules(values: dict[str, Any], look_time: float) -> list[ModuleRecord]:
     except ActuatorError:
         return []
     finally:
-        port.let_go()
+        port.release()
     # An emulator has no network card; its address identifies it.
     return [
         ModuleRecord(

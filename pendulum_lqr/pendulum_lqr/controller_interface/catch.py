@@ -18,7 +18,7 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Catch", "CatchingController"]
 
-_LET_GO = 2.0
+_RELEASE = 2.0
 _SHARE = 0.9
 """Default share of the proven level in which it takes over."""
 
@@ -77,7 +77,7 @@ class CatchingController(BaseController):
         super().__init__(p["effort_limit"], p["set_point"])
         gain, level, hold = _proven(plant, tuple(p["catch_q"]), p["catch_r"], self.effort_limit, self.set_point)
         share = p.get("catch_share", _SHARE)
-        self.catch = Catch(gain, share * level, _LET_GO * level, self.effort_limit, self.set_point, hold)
+        self.catch = Catch(gain, share * level, _RELEASE * level, self.effort_limit, self.set_point, hold)
 
     def reset(self) -> None:
         """Release."""

@@ -174,7 +174,7 @@ def play_on_running_plant(
         orchestrator.wait_for("the end of the excitation", lambda: _watch(plant, play), play.duration + START_TIMEOUT)
         orchestrator.spin(_REST)
         if not armed:
-            session.let_go()
+            session.disarm_all()
         # The plant is its commander's again: an error of the bag must not disarm it.
         session.leaves(plant)
         session.close(recorder)

@@ -157,7 +157,7 @@ def _keep_time(session: Session, plant: PlantClient, spec: RunSpec) -> None:
     )
     plant.mark(END_EVENT)
     orchestrator.spin(_LAST_WORDS)
-    session.let_go()
+    session.disarm_all()
 
 
 def _has_reached(plant: PlantClient, end_ns: int) -> bool:

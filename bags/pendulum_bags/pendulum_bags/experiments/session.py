@@ -92,7 +92,7 @@ class Session:
         """Leave a plant as it is from now on, also on an abort of the session."""
         self._driven = [one for one in self._driven if one is not plant]
 
-    def let_go(self) -> None:
+    def disarm_all(self) -> None:
         """Disarm what this session drives; a plant without response goes to rest by its own rules."""
         for plant in self._driven:
             plant.disarm_quietly()
@@ -142,7 +142,7 @@ def conduct(
         try:
             yield session
         except BaseException:
-            session.let_go()
+            session.disarm_all()
             raise
 
 

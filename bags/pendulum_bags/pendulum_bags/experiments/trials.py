@@ -206,7 +206,7 @@ def _run_trial(
             finished = plant.newest_event(Event.LOCKSTEP_FINISHED)
             assert finished is not None
             session.close_in_lockstep(recorder, plant, 1 + int(finished["steps"]), [names.APPLIED_EFFORT])
-        session.let_go()
+        session.disarm_all()
         orchestrator.spin(0.2)
     return bag
 

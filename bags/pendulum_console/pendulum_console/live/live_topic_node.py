@@ -42,7 +42,7 @@ class LiveTopic:
     def take(self) -> None:
         """Pass on what has arrived; subscribe while there is a viewer."""
         if not self._channel.has_sinks():
-            self._let_go()
+            self._unsubscribe()
             return
         if self._source is None:
             self._source = self._subscribe()
@@ -61,10 +61,10 @@ class LiveTopic:
 
     def close(self) -> None:
         """Close the viewers' channel."""
-        self._let_go()
+        self._unsubscribe()
         self._channel.close()
 
-    def _let_go(self) -> None:
+    def _unsubscribe(self) -> None:
         if self._source is not None:
             self._node.destroy_polled_input(self._source)
             self._source = self._newest = None
