@@ -465,7 +465,7 @@ def test_setpoints_that_were_kept_do_not_outlive_the_connection_and_a_new_one_is
     first.stop()
     # What the other joint has kept is still there, since it is let go without a stop.
     rig.shared.keep(1, Command(pwm=0.25))
-    rig.shared._stop_told = {0}
+    rig.shared._stop_reported = {0}
     for port in (first, second):
         port.release()  # type: ignore[attr-defined]
     for port in (first, second):

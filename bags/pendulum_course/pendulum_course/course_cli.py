@@ -111,7 +111,7 @@ def gains(
     from pendulum_course.checks import check_gains
     from pendulum_lqr.design_command.design_cli import read_diagonal
 
-    return _told(check_gains(_tasks(course), read_diagonal(q), r), as_json=as_json)
+    return _print_judgement(check_gains(_tasks(course), read_diagonal(q), r), as_json=as_json)
 
 
 @check.command()
@@ -133,7 +133,7 @@ def plant(
     truth, sealed = load_plant_to_run(hidden)
     if not sealed:
         raise ParameterError(f"plant file {hidden} is not sealed; expected it as the course wrote it")
-    return _told(check_plant(truth, load_plant(file)), as_json=as_json)
+    return _print_judgement(check_plant(truth, load_plant(file)), as_json=as_json)
 
 
 @check.command()
@@ -148,7 +148,7 @@ def delay(
     """
     from pendulum_course.checks import check_delay
 
-    return _told(check_delay(_tasks(course), delay), as_json=as_json)
+    return _print_judgement(check_delay(_tasks(course), delay), as_json=as_json)
 
 
 @check.command()
@@ -164,7 +164,7 @@ def noise(
     """
     from pendulum_course.checks import check_noise
 
-    return _told(check_noise(_tasks(course), ratio, because), as_json=as_json)
+    return _print_judgement(check_noise(_tasks(course), ratio, because), as_json=as_json)
 
 
 @check.command()
@@ -189,7 +189,7 @@ def winner(
         except KeyboardInterrupt:
             typer.echo("interrupted: all programs have ended", err=True)
             raise typer.Exit(EXIT_INTERRUPTED) from None
-    return _told(judgement, as_json=as_json)
+    return _print_judgement(judgement, as_json=as_json)
 
 
 @check.command()
@@ -204,7 +204,7 @@ def fault(
     """
     from pendulum_course.checks import check_fault
 
-    return _told(check_fault(_tasks(course), bag), as_json=as_json)
+    return _print_judgement(check_fault(_tasks(course), bag), as_json=as_json)
 
 
 def _tasks(course: Path) -> Tasks:
@@ -218,7 +218,7 @@ def _tasks(course: Path) -> Tasks:
     return read_tasks(path)
 
 
-def _told(judgement: Judgement, *, as_json: bool) -> int:
+def _print_judgement(judgement: Judgement, *, as_json: bool) -> int:
     if as_json:
         print(json.dumps({"right": judgement.right, "reason": judgement.reason}))
     else:

@@ -74,7 +74,7 @@ class HebiGroup:
         self._asked: list[Strategy] = []
         self._possible: list[set[Strategy]] = []
         self._setpoints: dict[int, Command] = {}
-        self._stop_told: set[int] | None = None
+        self._stop_reported: set[int] | None = None
         self._stop_error: Exception | None = None
         self._users = 0
 
@@ -132,7 +132,7 @@ class HebiGroup:
         self._possible = [{Strategy.OFF} for _ in records]
         self._check_info(_answered(group.request_info(ACKNOWLEDGE_MS)))
         self._setpoints.clear()
-        self._stop_told = self._frame = None
+        self._stop_reported = self._frame = None
         self._packet, self._buffer = packet, hebi.GroupFeedback(group.size)
         if self._log is not None:
             start_log(group, self._log)
@@ -141,7 +141,7 @@ class HebiGroup:
 
     def keep(self, index: int, command: Command) -> None:
         """Store a joint's setpoints for the next round of packets."""
-        self._stop_told = None
+        self._stop_reported = None
         self._setpoints[index] = command
 
     def send(self) -> None:
@@ -160,7 +160,7 @@ class HebiGroup:
         """
         if index not in self.driven:
             raise ActuatorError("exception", f"{self.names[index]} is passive: nothing is sent to its module but off")
-        self._stop_told = None
+        self._stop_reported = None
         if strategy is not None:
             # A requested strategy may be in force: the acknowledgement can get lost.
             self._asked[index] = strategy
@@ -198,13 +198,13 @@ class HebiGroup:
         Raises:
             ActuatorError: A module has not confirmed that it is off.
         """
-        if self._stop_told is None or index in self._stop_told:
-            self._stop_told, self._stop_error = set(), None
+        if self._stop_reported is None or index in self._stop_reported:
+            self._stop_reported, self._stop_error = set(), None
             try:
                 self._stop_all()
             except Exception as error:  # noqa: BLE001  (each joint gets it)
                 self._stop_error = error
-        self._stop_told.add(index)
+        self._stop_reported.add(index)
         if self._stop_error is not None:
             raise self._stop_error
 

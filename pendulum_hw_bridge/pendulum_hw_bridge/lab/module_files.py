@@ -90,7 +90,7 @@ def restore_group(group: Any, folder: Path, make_command: Callable[[], Any], say
         # An empty command of hebi-py reads as position 0; NaN cannot be taken for a setpoint.
         command.position = command.velocity = command.effort = math.nan
         commands.append((name, command))
-    with _told_if_broken_off(folder, say):
+    with _warn_if_interrupted(folder, say):
         for name, command in commands:
             if not any(group.send_command_with_acknowledgement(command, _ANSWER_MS) for _ in range(_ATTEMPTS)):
                 raise ActuatorError(
@@ -146,13 +146,13 @@ def restore_emulator(port: ActuatorPort, folder: Path, say: Callable[[str], None
         limits = limits_from_json(json.loads(read_text(folder / LIMITS, "backup")))
     except ValueError as error:
         raise ParameterError(f"backup {folder / LIMITS} is not understood: {error}") from error
-    with _told_if_broken_off(folder, say):
+    with _warn_if_interrupted(folder, say):
         if port.set_gains(gains) != gains or port.set_limits(limits) != limits:
             raise ActuatorError("no_acknowledgement", f"emulator reads back other values than those of {folder}")
 
 
 @contextlib.contextmanager
-def _told_if_broken_off(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
+def _warn_if_interrupted(folder: Path, say: Callable[[str], None]) -> Iterator[None]:
     """Warn if an error or Ctrl-C may have left a mixture of two sets of settings."""
     try:
         yield

@@ -65,7 +65,7 @@ class HandTrial(Trial):
     def __init__(self, number: int, motion: HandMotion | None) -> None:
         super().__init__(number)
         self.motion = motion
-        self._told_start = False
+        self._logged_start = False
 
     def answer(self, sample: JointSample) -> TrialAnswer:
         """Return zero torque for the drive, and the hand's torque for the link."""
@@ -74,8 +74,8 @@ class HandTrial(Trial):
         if self.start_ns is None or self.finished:
             return TrialAnswer(push=push)
         events: list[Event] = []
-        if not self._told_start:
-            self._told_start = True
+        if not self._logged_start:
+            self._logged_start = True
             who = "a person" if motion is None else "simulated"
             direction = 0 if motion is None else motion.direction
             details = {"trial": self.number, "procedure": "hand", "hand": who, "direction": direction}

@@ -81,7 +81,7 @@ class DisturbanceNode(PollingNode):
             for signal in _signals(self._settings.values)
         ]
         self._loop = self._loops[0]
-        self._told_others = False
+        self._logged_others = False
         self._torque_publisher = self.create_publisher(JointState, names.DISTURBANCE, qos.COMMAND)
         self._first_answer = FirstAnswer(self, self._torque_publisher)
         self._event_publisher = self.create_publisher(String, names.EVENTS, qos.EVENTS)
@@ -135,8 +135,8 @@ class DisturbanceNode(PollingNode):
 
     def _tell_others(self, found: tuple[str, ...]) -> None:
         """Log once that the states are of other joints, because then no disturbance acts."""
-        if found and not self._told_others:
-            self._told_others = True
+        if found and not self._logged_others:
+            self._logged_others = True
             self.get_logger().error(
                 f"states of {', '.join(found)}; expected {', '.join(self._joints)} among them: say which to disturb "
                 f"with -p joints:='[{found[-1]}]'"

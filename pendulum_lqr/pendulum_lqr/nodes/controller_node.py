@@ -120,12 +120,12 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._simulated_time = bool(self.get_parameter("use_sim_time").value)
         self._watch = PeriodWatch(exact=self._simulated_time)
         self._period_known = False
-        self._told_other_rate = False
+        self._logged_other_rate = False
         self._refusal = ""
-        self._told_notice = ""
+        self._logged_notice = ""
         self._now = SteadyWallClock()
         self._full_name = self.get_fully_qualified_name()
-        self._told_refusals = 0
+        self._logged_refusals = 0
         self._multi_array = self._settings["command_type"] == "multi_array"
         if self._multi_array:
             self._command_publisher = self.create_publisher(Float64MultiArray, _MULTI_ARRAY_TOPIC, qos.COMMAND)
@@ -238,11 +238,11 @@ class ControllerNode(LifecycleNode, PollingNode):
         if self._loop is None:
             return
         refused = sum(self._loop.refused.values())
-        if refused > self._told_refusals:
+        if refused > self._logged_refusals:
             counts = ", ".join(f"{why.value} {count}" for why, count in sorted(self._loop.refused.items()))
             reason = f" ({self._loop.last_reason})" if self._loop.last_reason else ""
             self.get_logger().warning(f"states refused so far: {counts}{reason}")
-            self._told_refusals = refused
+            self._logged_refusals = refused
 
     def _choose(self, name: str) -> str:
         """Return the selected controller or plant, before its parameters can be declared."""
@@ -363,16 +363,16 @@ class ControllerNode(LifecycleNode, PollingNode):
             if other_rate:
                 level = DiagnosticStatus.WARN
                 text = f"{text}; states come every {measured:g} s, designed for {self._period:g} s"
-                if not self._told_other_rate:
+                if not self._logged_other_rate:
                     self.get_logger().warning(text)
-            self._told_other_rate = other_rate
+            self._logged_other_rate = other_rate
         notice = "" if self._loop is None else unwrapped(self._loop.controller).notice
         if notice:
             level = max(level, DiagnosticStatus.WARN)
             text = f"{text}; {notice}"
-            if notice != self._told_notice:
+            if notice != self._logged_notice:
                 self.get_logger().warning(notice)
-        self._told_notice = notice
+        self._logged_notice = notice
         if self._running_plant.mismatch:
             level = max(level, DiagnosticStatus.WARN)
             text = f"{text}; {self._running_plant.mismatch}"

@@ -221,7 +221,7 @@ def _ask(job: tuple[Sequence[Piece], Sequence[str], str], index: int, _threads: 
         plants, facts = [""], {}
         if reading.has_states:
             with read_bag(piece.path) as bag:
-                plants, facts = _plants(bag), _told(bag)
+                plants, facts = _plants(bag), _run_facts(bag)
     except Exception as error:  # noqa: BLE001  # one bag must not cost the table of a thousand others
         return [{"bag": piece.name, "plant": "", "error": _sentence(error)}]
     if not plants:
@@ -264,7 +264,7 @@ def _plants(bag: Bag) -> list[str]:
     return sorted(topic[: -len(ending)] for topic in bag.topics if topic.endswith(ending))
 
 
-def _told(bag: Bag) -> Row:
+def _run_facts(bag: Bag) -> Row:
     """Return the bag's facts about its run that fit a table."""
     run = run_record(bag.metadata)
     controller = run.get("controller")

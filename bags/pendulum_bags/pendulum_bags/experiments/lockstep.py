@@ -48,7 +48,7 @@ _RUN_LISTENERS = {
     names.EVENTS: 2,
 }
 """Subscribers of each topic of a run: its reader, the recorder, and for events the orchestrator."""
-_TOLD_EACH_STEP = (names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT)
+_PUBLISHED_EACH_STEP = (names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT)
 
 
 def run_lockstep(
@@ -137,7 +137,7 @@ def record_run(
         if not spec.has_bridge:
             plant.resume(START_TIMEOUT)
         _wait_for_end(session.orchestrator, plant, spec.duration)
-        session.close_in_lockstep(recorder, plant, spec.steps + 1, _TOLD_EACH_STEP)
+        session.close_in_lockstep(recorder, plant, spec.steps + 1, _PUBLISHED_EACH_STEP)
     return bag
 
 

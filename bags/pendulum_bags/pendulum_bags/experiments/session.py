@@ -70,17 +70,17 @@ class Session:
             raise FaultError(recorder.last_words(1))
 
     def close_in_lockstep(
-        self, recorder: Child, plant: PlantClient, states: int, steps_are_told_on: Collection[str] = ()
+        self, recorder: Child, plant: PlantClient, states: int, published_each_step: Collection[str] = ()
     ) -> None:
         """Close the bag of a run in lockstep when it is complete; a FaultError if messages were lost.
 
         Messages of ending nodes are no part of the run. ``states`` is the number that the plant has published;
-        ``steps_are_told_on`` are relative names of topics with a message per step, one fewer than states: what a
+        ``published_each_step`` are relative names of topics with a message per step, one fewer than states: what a
         publisher sends before it has matched the recorder is lost, and a short run can be over by then.
         """
         # The clock ticks once for each state, and no topic waits for another.
         expected = {f"{plant.namespace}/{names.JOINT_STATES}": states, names.CLOCK: states}
-        expected |= {f"{plant.namespace}/{topic}": states - 1 for topic in steps_are_told_on}
+        expected |= {f"{plant.namespace}/{topic}": states - 1 for topic in published_each_step}
         RecorderClient(self.orchestrator, plant.namespace).wait_for_all(expected)
         self.close(recorder)
 

@@ -73,9 +73,9 @@ class LiveNode(PollingNode):
         self._sent = self._lost = 0
         self._unknown: set[str] = set()
         self._plants: set[str] = set()
-        self._told: queue.SimpleQueue[str] = queue.SimpleQueue()
+        self._log_lines: queue.SimpleQueue[str] = queue.SimpleQueue()
         self._began = time.monotonic()
-        self._no_plant_told = False
+        self._no_plant_reported = False
         self._reader = ParameterReader(self, self._on_values)
         self._setters: dict[str, Any] = {}
         self._setters_lock = threading.Lock()
@@ -87,7 +87,7 @@ class LiveNode(PollingNode):
                 options.port,
                 (server_host, self._server.port),
                 lambda request: refusal(request, options.token, options.origins),
-                self._told.put,
+                self._log_lines.put,
             )
         except PendulumError:
             self._server.stop()
@@ -104,16 +104,16 @@ class LiveNode(PollingNode):
         self._topics.clear()
         self._server.stop()
         self._gate.close()
-        self._print_told()
+        self._print_log_lines()
         print(f"handed on {self._sent} messages; {self._lost} were lost on the way from their publishers", flush=True)
 
-    def _print_told(self) -> None:
+    def _print_log_lines(self) -> None:
         """Print the gate's lines in this thread, so that they do not mix."""
-        while not self._told.empty():
-            print(self._told.get(), flush=True)
+        while not self._log_lines.empty():
+            print(self._log_lines.get(), flush=True)
 
     def _take(self) -> None:
-        self._print_told()
+        self._print_log_lines()
         for topic in self._topics.values():
             topic.take()
 
@@ -156,9 +156,9 @@ class LiveNode(PollingNode):
                 f"no plant on ROS domain {self.context.get_domain_id()}; start one, such as python -m pendulum_sim "
                 "simulator --ros-args -r __ns:=/sim, or choose another domain (ROS_DOMAIN_ID)"
             )
-            if not self._no_plant_told:
+            if not self._no_plant_reported:
                 print(text, flush=True)
-            self._no_plant_told = True
+            self._no_plant_reported = True
             self._server.publish_status(text, foxglove.StatusLevel.Warning, "no plant")
 
     def _look_for_services(self) -> None:

@@ -161,7 +161,7 @@ class Recorder(PollingNode):
 
     def _poll(self) -> None:
         try:
-            self._poll_until_told()
+            self._poll_until_stopped()
         except Exception as error:  # noqa: BLE001  # a recorder that receives nothing any more must not seem alive
             self.exit_code = 1
             with self._lock:
@@ -169,7 +169,7 @@ class Recorder(PollingNode):
                     self._session.fail(error)
             self._stop()
 
-    def _poll_until_told(self) -> None:
+    def _poll_until_stopped(self) -> None:
         while not self._leave.wait(POLL_PERIOD):
             with self._lock:
                 self._take_all()

@@ -66,7 +66,7 @@ class Tap:
             durability=DurabilityPolicy.TRANSIENT_LOCAL if self.latched else DurabilityPolicy.VOLATILE,
         )
         self._opened = self._first_opened = time.monotonic()
-        self._told_unmet = 0
+        self._reported_unmet = 0
         self.source = node.create_polled_input(class_of(name), topic, profile)
         # Taken on demand, not delivered by the executor, so that it is as recent as the messages.
         handle = self.source.subscription.handle
@@ -115,8 +115,8 @@ class Tap:
 
     def unheard(self) -> int:
         """Return how many messages publishers had sent before the first one received, since the last call."""
-        unheard = self._gaps.unmet - self._told_unmet
-        self._told_unmet = self._gaps.unmet
+        unheard = self._gaps.unmet - self._reported_unmet
+        self._reported_unmet = self._gaps.unmet
         return unheard
 
     def close(self) -> None:

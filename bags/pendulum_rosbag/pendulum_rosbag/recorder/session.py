@@ -127,7 +127,7 @@ class RecordingSession:
         self._sync_interval = sync_interval
         self._on_failure = on_failure
         self._counts: dict[str, TopicCount] = {}
-        self._told: dict[str, dict[str, int]] = {}
+        self._reported_gaps: dict[str, dict[str, int]] = {}
         self._queue: list[tuple[str, int, bytes]] = []
         self._queued_bytes = 0
         self._lock = threading.Lock()
@@ -241,9 +241,9 @@ class RecordingSession:
             for name, count in self._counts.copy().items()
             if count.missing or count.refused or count.early or count.before
         }
-        if gaps != self._told:
+        if gaps != self._reported_gaps:
             self.writer.update_metadata({_COUNTS: gaps})
-            self._told = gaps
+            self._reported_gaps = gaps
 
     def _store_counts(self) -> None:
         self.writer.seal()
