@@ -314,7 +314,7 @@ def test_while_no_record_comes_commands_are_taken_and_silence_is_acted_upon() ->
     assert done == [0.005, 0.0, "act"]
 
 
-def test_the_record_of_a_cycle_in_which_the_loop_is_told_to_rest_still_leaves(running: Running) -> None:
+def test_the_record_of_a_cycle_in_which_the_loop_is_requested_to_rest_still_leaves(running: Running) -> None:
     running.on_outcome = lambda outcome: setattr(running.loop, "active", False)
     running.loop.active = True
     running.until(lambda: running.outcomes and not running.loop.active, "an outcome")
@@ -358,7 +358,7 @@ def test_a_record_is_computed_while_it_is_on_its_way_and_not_when_it_should_be_t
     assert waited_for > 25
 
 
-def test_an_error_in_a_cycle_releases_the_drive_and_is_told(running: Running) -> None:
+def test_an_error_in_a_cycle_releases_the_drive_and_is_reported(running: Running) -> None:
     running.arm()
 
     def fail(sample: JointSample) -> None:
@@ -401,7 +401,7 @@ def test_whichever_step_breaks_the_drive_is_off_before_the_record_of_that_cycle_
     assert leaving is (Strategy.DIRECT_PWM if step == "on_records" else Strategy.OFF)
 
 
-def test_when_something_breaks_the_drive_is_off_before_anything_is_told_and_the_loop_rests_a_period() -> None:
+def test_when_something_breaks_the_drive_is_off_before_anything_is_reported_and_the_loop_rests_a_period() -> None:
     done: list[str] = []
     loop: Any = SimpleNamespace(
         bridge=SimpleNamespace(

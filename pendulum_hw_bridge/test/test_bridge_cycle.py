@@ -337,7 +337,7 @@ def test_a_bridge_that_closes_says_that_a_module_did_not_confirm_its_stop() -> N
 
 
 @pytest.mark.parametrize(("tell", "told"), [("fault", "fail"), ("disarm", "close")])
-def test_the_drive_is_off_before_the_supervisor_is_told_which_may_have_to_be_waited_for(
+def test_the_drive_is_off_before_the_supervisor_is_reported_which_may_have_to_be_waited_for(
     tell: str, told: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = Rig().armed()
@@ -453,7 +453,7 @@ def test_feedback_that_stays_away_ends_an_armed_drive_and_is_none_at_rest() -> N
     assert rig.supervisor.mode is Mode.FAULT
 
 
-def test_feedback_that_seemed_lost_and_comes_late_is_told_so_once_in_the_fault_state_only() -> None:
+def test_feedback_that_seemed_lost_and_comes_late_is_reported_so_once_in_the_fault_state_only() -> None:
     def late(rig: Rig) -> None:
         rig.port.time_ns += TIMEOUT + 2 * STEP
         rig.port.records.append(rig.record(hardware_ns=rig.port.time_ns - TIMEOUT - MILLISECOND))
@@ -549,7 +549,7 @@ def test_at_rest_a_pause_is_no_stall_and_the_first_turn_has_none_before_it() -> 
 
 
 @pytest.mark.parametrize("sign", [1, -1])
-def test_a_torque_is_sent_in_the_motors_sign_and_told_in_the_joints(sign: int) -> None:
+def test_a_torque_is_sent_in_the_motors_sign_and_reported_in_the_joints(sign: int) -> None:
     rig = Rig(joint_sign=sign).armed()
     outcome = rig.drive(1.0, push=(0.5,))
     assert rig.port.pushes == [0.5]

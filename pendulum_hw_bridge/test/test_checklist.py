@@ -318,7 +318,7 @@ def test_a_wrong_command_line_is_one_sentence(
     assert "Traceback" not in printed.err
 
 
-def test_a_lab_file_with_a_value_that_the_bridge_refuses_is_told_with_its_entry(
+def test_a_lab_file_with_a_value_that_the_bridge_refuses_is_reported_with_its_entry(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     lab = tmp_path / "lab.yaml"

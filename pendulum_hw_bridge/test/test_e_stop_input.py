@@ -31,7 +31,7 @@ def test_silence_stops_as_a_press_does(silence: int, stops: bool) -> None:
         assert reason == f"e-stop button is silent for {silence} ms"
 
 
-def test_two_who_publish_for_one_button_stop_whatever_they_say_and_a_press_is_told_first() -> None:
+def test_two_who_publish_for_one_button_stop_whatever_they_say_and_a_press_is_reported_first() -> None:
     button = EStopInput(0.5)
     button.hear(pressed=False, now_ns=0)
     button.count(2)

@@ -167,7 +167,7 @@ def test_a_passive_joint_has_a_port_without_any_way_to_give_torque() -> None:
         assert not hasattr(shoulder, name)
 
 
-def test_a_read_waits_for_the_next_record_and_no_longer_than_told() -> None:
+def test_a_read_waits_for_the_next_record_and_no_longer_than_configured() -> None:
     _, clock, (shoulder, elbow) = ports_of()
     assert shoulder.read(0.01) is not None
     assert clock.now_ns() == SECOND + 400_000

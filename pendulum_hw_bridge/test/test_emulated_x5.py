@@ -277,7 +277,7 @@ def test_a_hot_motor_is_taken_off_by_its_firmware() -> None:
     assert actuator.link.pwm == 0.0
 
 
-def test_lock_is_told_in_the_feedback() -> None:
+def test_lock_is_reported_in_the_feedback() -> None:
     actuator = x5(load_emulator("x5_9"))
     actuator.inject(ActuatorFault.LOCKED_BY_OTHER)
     actuator.advance_to(20_000_000)

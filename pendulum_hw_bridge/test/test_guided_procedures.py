@@ -82,7 +82,7 @@ def test_a_zero_that_was_found_makes_the_hanging_joint_read_zero(
     assert found.sign * encoder + found.offset == pytest.approx(0.0, abs=0.03)
 
 
-def test_two_turns_the_same_way_or_none_are_told() -> None:
+def test_two_turns_the_same_way_or_none_are_reported() -> None:
     rig = Rig()
     hand, _ = rig.hands()
     with pytest.raises(ActuatorError, match="both turns went the same way"):
@@ -139,7 +139,7 @@ def test_the_torque_ends_by_itself_when_nobody_commands(lifetime: float) -> None
     assert abs(rig.actuator.link.position) < math.radians(15.0)
 
 
-def test_a_lifetime_that_does_not_end_the_torque_is_told_and_the_motor_is_stopped(
+def test_a_lifetime_that_does_not_end_the_torque_is_reported_and_the_motor_is_stopped(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     rig = Rig()
@@ -292,7 +292,7 @@ def test_a_module_that_goes_while_somebody_waits_for_it_is_missed_within_two_sec
 @pytest.mark.parametrize(
     ("fault", "what"), [(ActuatorFault.POSITION_NAN, "position"), (ActuatorFault.EFFORT_NAN, "effort")]
 )
-def test_what_is_no_number_is_told_at_once_and_reaches_no_lab_file(fault: ActuatorFault, what: str) -> None:
+def test_what_is_no_number_is_reported_at_once_and_reaches_no_lab_file(fault: ActuatorFault, what: str) -> None:
     rig = Rig()
     rig.actuator.inject(fault)
     begin_ns = rig.port.now_ns()
@@ -306,7 +306,7 @@ def test_what_is_no_number_is_told_at_once_and_reaches_no_lab_file(fault: Actuat
     assert rig.actuator.strategy is Strategy.OFF
 
 
-def test_a_person_is_told_that_a_turn_was_seen_only_where_it_was() -> None:
+def test_a_person_is_reported_that_a_turn_was_seen_only_where_it_was() -> None:
     rig = Rig()
     said: list[str] = []
     assert watch_nudge(rig.port, Person(said.append), patience=1.0) == 0.0

@@ -69,7 +69,7 @@ def test_the_tare_is_in_joint_coordinates_and_leaves_out_what_hangs_at_the_joint
     assert port.actuator.strategy is Strategy.OFF
 
 
-def test_the_noise_of_the_sensor_is_told_with_the_tare(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_noise_of_the_sensor_is_reported_with_the_tare(monkeypatch: pytest.MonkeyPatch) -> None:
     port, person, signs = emulator(), Person(), iter([1.0, -1.0] * 1000)
     changed(monkeypatch, port, lambda record: record._replace(position=0.0, effort=0.5 + 0.1 * next(signs)))
     guided.measure_tare(port, BridgeSettings(), PARAMETERS.plant, person)

@@ -66,7 +66,7 @@ def served() -> Iterator[Served]:
     one.end()
 
 
-def test_twins_are_told_apart_by_serial_and_one_that_falls_silent_is_stale(bench: tuple[Served, Served]) -> None:
+def test_twins_are_distinguished_by_serial_and_one_that_falls_silent_is_stale(bench: tuple[Served, Served]) -> None:
     lookup = open_lookup(f"emulator:{bench[0].where},{bench[1].where}")
     seen = sorted(discover(lookup, look_time=0.25), key=lambda one: one.serial)
     assert [(one.serial, one.type, one.stale) for one in seen] == [("X5-9-1", "X5-9", False), ("X5-9-2", "X5-9", False)]

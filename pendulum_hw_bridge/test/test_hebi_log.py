@@ -136,7 +136,7 @@ def test_the_log_begins_with_the_connection_and_ends_with_it(tmp_path: Path) -> 
     assert notes[-1] == ("stop",)
 
 
-def test_a_log_that_cannot_be_written_is_told_before_anything_is_driven(tmp_path: Path) -> None:
+def test_a_log_that_cannot_be_written_is_reported_before_anything_is_driven(tmp_path: Path) -> None:
     log = tmp_path / "hw.hebilog"
     port = HebiBackend(make_group=lambda: util.create_imitation_group(1), imitation=True, log=log)
     with pytest.raises(ActuatorError, match=r"HEBI log .*hw.hebilog cannot be started"):

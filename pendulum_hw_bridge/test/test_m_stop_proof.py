@@ -58,7 +58,7 @@ def test_a_motion_stop_that_ends_it_is_proved(monkeypatch: pytest.MonkeyPatch, r
     assert "Press the motion stop NOW." in bench.person.said
 
 
-def test_a_motion_stop_is_proved_within_60_ms_and_waited_for_no_longer_than_told(
+def test_a_motion_stop_is_proved_within_60_ms_and_waited_for_no_longer_than_configured(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked: list[tuple[int, float]] = []
@@ -188,7 +188,7 @@ def test_a_computer_that_stalls_proves_no_motion_stop_that_does_nothing(
     assert stalled
 
 
-def test_a_pause_between_two_commands_as_long_as_their_lifetime_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pause_between_two_commands_as_long_as_their_lifetime_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     port = emulator()
     drive = proofs._GentleDrive(port, BridgeSettings(command_lifetime=0.05), None, None)
     sent = iter([drive.begin_ns + 49_999_999, drive.begin_ns + 99_999_999])

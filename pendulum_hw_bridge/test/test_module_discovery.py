@@ -66,7 +66,7 @@ def look(*modules: ModuleRecord, at_once: bool = True) -> list[ModuleRecord]:
     return discover(Network(*modules, at_once=at_once), wait=lambda seconds: None)
 
 
-def test_each_module_is_told_with_all_that_tells_it_from_others() -> None:
+def test_each_module_is_reported_with_all_that_tells_it_from_others() -> None:
     (seen,) = look(module(1))
     assert seen == ModuleRecord(
         "Lab", "Pendulum", "D8:80:39:00:00:01", "X5-01", "X5-9", "15.2", "127.0.0.1", stale=False

@@ -147,7 +147,7 @@ def test_a_backup_of_which_one_file_cannot_be_read_is_sent_to_no_module(tmp_path
     assert (sent, said) == ([], [])
 
 
-def test_a_module_that_acknowledges_nothing_is_asked_three_times_and_told(tmp_path: Path) -> None:
+def test_a_module_that_acknowledges_nothing_is_asked_three_times_and_reported(tmp_path: Path) -> None:
     hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
     module, said, asked = Module(hebi), list[str](), list[int]()
     backup_group(module, tmp_path / "before")
@@ -174,7 +174,7 @@ def test_a_backup_from_before_either_end_was_kept_is_given_back_too(tmp_path: Pa
     assert module.state.position_kp[0] == 2.5
 
 
-def test_an_emulator_that_keeps_other_values_or_files_that_say_nothing_are_told(
+def test_an_emulator_that_keeps_other_values_or_files_that_say_nothing_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port, said = emulator(), list[str]()
@@ -195,7 +195,7 @@ def test_an_emulator_that_keeps_other_values_or_files_that_say_nothing_are_told(
     assert not (tmp_path / "other").exists()
 
 
-def test_open_ends_of_a_file_are_set_as_infinite_and_what_is_no_number_is_told(tmp_path: Path) -> None:
+def test_open_ends_of_a_file_are_set_as_infinite_and_what_is_no_number_is_reported(tmp_path: Path) -> None:
     path = tmp_path / "safety.xml"
 
     def ends_of(low: str, high: str) -> dict[str, float]:
@@ -296,7 +296,7 @@ def test_each_gain_and_limit_comes_back_to_the_last_bit_small_ones_too(tmp_path:
     assert {name: float(getattr(info, name)[0]) for name in kept} == kept
 
 
-def test_a_gain_that_comes_back_wrong_by_less_than_six_decimals_is_told(tmp_path: Path) -> None:
+def test_a_gain_that_comes_back_wrong_by_less_than_six_decimals_is_reported(tmp_path: Path) -> None:
     hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
     info = hebi.GroupCommand(1)
     info.position_kp, info.velocity_ki = 1.0, 3e-7

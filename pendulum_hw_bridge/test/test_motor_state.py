@@ -56,7 +56,7 @@ def test_the_voltage_is_the_highest_of_five_records_within_its_window() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_the_speed_told_is_believed_as_far_as_the_angle_bears_it_out(sign: float) -> None:
+def test_the_speed_reported_is_believed_as_far_as_the_angle_bears_it_out(sign: float) -> None:
     for told, believed in ((1.0, 1.0), (2.25, 2.25), (2.0 + 1.5 * SLACK, 2.0 + SLACK), (-9.0, 2.0 - SLACK)):
         moving = Moving()
         assert moving.see().velocity == 0.0

@@ -91,7 +91,7 @@ def test_feedback_is_heard_for_its_time_and_no_longer() -> None:
     assert len(list(feedback_for(Scripted(always(0.0)), 1.0))) == 20  # type: ignore[arg-type]
 
 
-def test_silence_of_a_second_is_told_and_counts_from_the_last_record() -> None:
+def test_silence_of_a_second_is_reported_and_counts_from_the_last_record() -> None:
     port = Scripted(after(0.0, None, None, 0.0, then=None))
     begin_ns, heard = port.now_ns(), list[Feedback]()
     with pytest.raises(ActuatorError, match="no feedback for 1 s; expected it to flow: is the module still there"):

@@ -211,7 +211,7 @@ def test_a_duty_that_the_firmware_took_back_is_compared_inclusively() -> None:
 @pytest.mark.parametrize("name", ["ki", "kd", "dead_zone", "punch"])
 @pytest.mark.parametrize("loop", ["position", "velocity"])
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_of_a_loop_with_a_memory_only_the_largest_output_can_be_told(name: str, loop: str, sign: float) -> None:
+def test_of_a_loop_with_a_memory_only_the_largest_output_can_be_reported(name: str, loop: str, sign: float) -> None:
     bounds = {"min_output": -0.25, "max_output": 0.25}
     gains = replace(GAINS, position=PidGains(kp=0.5, **bounds), velocity=PidGains(kp=0.25, **bounds))
     gains = replace(gains, **{loop: replace(gains.loop(loop), **{name: 1e-3})})

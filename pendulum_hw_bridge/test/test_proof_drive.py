@@ -185,7 +185,7 @@ def test_a_motor_is_stopped_whatever_ends_what_it_does(error: BaseException) -> 
     ],
 )
 @BOTH
-def test_what_goes_wrong_is_told_at_once_also_while_the_duty_should_end(
+def test_what_goes_wrong_is_reported_at_once_also_while_the_duty_should_end(
     monkeypatch: pytest.MonkeyPatch, proof: Any, change: dict[str, float], message: str, at: float
 ) -> None:
     bench = Bench(monkeypatch, press_at=0.3 if proof is proofs.prove_m_stop else math.inf)
@@ -234,7 +234,9 @@ class GivenDrive:
         pass
 
 
-def test_the_motor_is_driven_for_the_times_that_a_person_is_told_and_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_motor_is_driven_for_the_announced_times_and_no_longer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(proofs, "_end_of_duty", lambda *_: 0.05)
     drive = GivenDrive(monkeypatch, 0, 299_999_999, 300_000_000)
     proofs.prove_lifetime(emulator(), BridgeSettings(), Person())

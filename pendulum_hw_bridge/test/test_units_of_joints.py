@@ -82,7 +82,7 @@ def test_a_refusal_about_a_cart_is_in_newtons(refused: Callable[[], object], mes
     assert "N m" not in str(caught.value)
 
 
-def test_a_drive_of_a_cart_that_does_not_follow_is_told_in_newtons() -> None:
+def test_a_drive_of_a_cart_that_does_not_follow_is_reported_in_newtons() -> None:
     specs = for_plant(SPECS, "cart_pole")
     values = validate(specs, {"plant": "cart_pole", "backend": "emulator"})
     cart, pole = assemble(values, specs).modules(WallClock())

@@ -171,7 +171,7 @@ def test_a_wrong_address_is_refused(address: str) -> None:
         wire.parse_address(address)
 
 
-def test_an_address_in_use_is_told() -> None:
+def test_an_address_in_use_is_reported() -> None:
     with pytest.raises(PendulumError, match="emulator cannot listen on"):
         EmulatorServer(SERVED.actuator, SERVED.address)
 

@@ -171,7 +171,7 @@ def test_unlimited_mpc_is_the_discrete_lqr_and_limited_mpc_keeps_the_limit():
 
 
 @pytest.mark.parametrize(("name", "answered"), [("mpc", "the LQR"), ("nmpc", "the last plan")])
-def test_where_a_solver_finds_no_plan_the_user_is_told(
+def test_where_a_solver_finds_no_plan_the_user_is_informed(
     name: str, answered: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = make_controller(name, DFKI, 0.01)

@@ -209,7 +209,7 @@ def test_the_filter_asks_for_a_fraction_of_the_effort_where_velocities_are_noise
     assert np.std(np.diff(filtered.efforts[late], axis=0)) < 0.4 * np.std(np.diff(plain.efforts[late], axis=0))
 
 
-def test_the_filter_is_that_of_python_control_and_uses_velocities_where_their_noise_is_told() -> None:
+def test_the_filter_is_that_of_python_control_and_uses_velocities_where_their_noise_is_reported() -> None:
     plant = load_mechanism("cart_pole")
     model = linearise(plant)
     sampled = discretise(model, PERIOD)

@@ -130,7 +130,7 @@ def test_a_cosine_from_hanging_another_order_and_stacked_samples_come_out_the_sa
         ("sac", {"observation": "angle,sin,velocity"}, None),
     ],
 )
-def test_what_was_told_has_to_agree_with_the_spaces(name, changes, words):
+def test_what_was_declared_has_to_agree_with_the_spaces(name, changes, words):
     if words is None:  # bounds of +-1 rad are those of a pendulum that is held within them
         assert imported(name, **changes).angle_box == (1.0,)
         return
@@ -138,7 +138,7 @@ def test_what_was_told_has_to_agree_with_the_spaces(name, changes, words):
         imported(name, **changes)
 
 
-def test_spaces_of_no_known_environment_want_to_be_told(tmp_path):
+def test_spaces_of_no_known_environment_must_be_declared(tmp_path):
     content = with_data(
         observation_space={
             **json.loads(members()["data"])["observation_space"],

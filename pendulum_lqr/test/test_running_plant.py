@@ -36,7 +36,7 @@ def watcher(domain_id: int) -> Iterator[Watcher]:
     peer.close()
 
 
-def test_another_plant_is_told_once_on_the_log_and_as_long_as_it_runs_in_diagnostics(
+def test_another_plant_is_reported_once_on_the_log_and_as_long_as_it_runs_in_diagnostics(
     watcher: Watcher, processes: Any
 ) -> None:
     here = ("--ros-args", "-r", "__ns:=/sim", "-p")

@@ -242,7 +242,7 @@ def test_who_may_not_write_to_a_file_does_not_replace_it_either(tmp_path: Path) 
     tmp_path.chmod(0o755)
 
 
-def test_what_cannot_be_written_is_told_in_a_sentence_with_the_thing_and_the_reason(tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_reported_in_a_sentence_with_the_thing_and_the_reason(tmp_path: Path) -> None:
     told = r"^plant file x cannot be written: No space left on device$"
     with pytest.raises(ParameterError, match=told), writing("plant file x", ParameterError):
         write_atomically(Path("/dev/full"), "lost")

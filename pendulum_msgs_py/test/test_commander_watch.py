@@ -82,7 +82,7 @@ def answer_twice(watched: Watched, effort: float, at_ns: int = START) -> None:
     watched.watch.suspect_twins(JointCommand.of_one(START, effort, "controller"), at_ns)
 
 
-def test_two_commanders_of_one_name_are_a_conflict_that_is_told_once_and_passes(watched: Watched) -> None:
+def test_two_commanders_of_one_name_are_a_conflict_that_is_reported_once_and_passes(watched: Watched) -> None:
     watched.commanders("controller")
     assert watched.conflict() == ""
     # Who they are takes ten times as long to ask as how many.
@@ -96,7 +96,7 @@ def test_two_commanders_of_one_name_are_a_conflict_that_is_told_once_and_passes(
     assert len(watched.graph.errors) == 1
 
 
-def test_what_was_seen_earlier_is_not_told_later(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_seen_earlier_is_not_reported_later(watched: Watched, monkeypatch: pytest.MonkeyPatch) -> None:
     looking, may_go_on = threading.Event(), threading.Event()
     count = watched.graph.count_publishers
 

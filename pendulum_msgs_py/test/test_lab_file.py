@@ -135,7 +135,7 @@ def test_a_limit_of_nothing_is_not_written_either(tmp_path: Path, value: float) 
     assert not (tmp_path / "lab.yaml").exists()
 
 
-def test_a_file_that_is_not_there_or_cannot_be_written_is_told(tmp_path: Path) -> None:
+def test_a_file_that_is_not_there_or_cannot_be_written_is_reported(tmp_path: Path) -> None:
     with pytest.raises(ParameterError, match=r"lab file .*none.yaml does not exist"):
         load_lab(tmp_path / "none.yaml")
     (tmp_path / "file").write_text("", encoding="utf-8")

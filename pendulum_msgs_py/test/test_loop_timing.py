@@ -59,7 +59,7 @@ def test_rate_jitter_overruns_and_latency_are_what_happened() -> None:
     assert statistics.summary(2000 * _MS)["rate_hz"] == 0.0
 
 
-def test_of_many_lines_one_a_second_is_told_and_none_is_forgotten() -> None:
+def test_of_many_lines_one_a_second_is_reported_and_none_is_forgotten() -> None:
     throttle = Throttle(1.0)
     told = [throttle.ask(0.05 * k) for k in range(100)]
     # Twenty a second for five seconds.
@@ -85,7 +85,7 @@ def test_durations_kept_several_at_a_time_are_those_kept_one_by_one(parts: list[
     assert list(several._values) == list(one_by_one._values)
 
 
-def test_cycles_told_several_at_a_time_are_those_told_one_by_one() -> None:
+def test_cycles_reported_several_at_a_time_are_those_reported_one_by_one() -> None:
     one_by_one, several = LoopStatistics(_MS), LoopStatistics(_MS)
     late = [1000 * k for k in range(40)]
     for part in (late[:25], late[25:]):

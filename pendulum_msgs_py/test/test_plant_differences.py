@@ -55,7 +55,7 @@ def test_every_parameter_of_the_drivetrain_is_compared(spec: ParameterSpec) -> N
     assert found.unit == spec.unit
 
 
-def test_the_differences_are_told_with_names_values_and_units() -> None:
+def test_the_differences_are_reported_with_names_values_and_units() -> None:
     running = THESIS.with_values(damping=5.0, transport_delay=0.004, name="worn")
     assert plant_mismatch(THESIS, [running]) == (
         "designed for plant 'thesis', but 'worn' runs: designed for damping 11.77, runs 5 N m s/rad; "

@@ -221,7 +221,7 @@ def test_a_press_that_was_counted_is_read_once_and_makes_earlier_requests_outdat
 
 
 @pytest.mark.parametrize(("set_by", "waited", "before"), [(0, 5, False), (0, 6, True), (-3600, 4, False), (1, 5, True)])
-def test_what_came_before_is_told_by_how_long_ago_whatever_the_system_clock_was_set_to(
+def test_what_came_before_is_reported_by_how_long_ago_whatever_the_system_clock_was_set_to(
     monkeypatch: pytest.MonkeyPatch, set_by: int, waited: int, before: bool
 ) -> None:
     # It happened 5 ns ago by the steady clock; of the system clock only what passed since the arrival counts.

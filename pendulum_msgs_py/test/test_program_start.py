@@ -210,7 +210,7 @@ def _app() -> typer.Typer:
     return app
 
 
-def test_a_program_that_told_of_its_interruption_is_not_told_of_again(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_program_that_reported_its_interruption_is_not_reported_again(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli_main(_app(), ["4.0"], name="python -m arm run") == 130
     assert capsys.readouterr().err == ""
 

@@ -143,7 +143,7 @@ def test_zero_leaves_everything_as_it_is() -> None:
     assert json.loads(done.stdout) == [[os.SCHED_OTHER, 0]] * 3, done.stderr
 
 
-def test_who_may_not_have_it_is_told_how_to_get_it() -> None:
+def test_who_may_not_have_it_is_shown_how_to_get_it() -> None:
     done = _ask(60, allowed=False)
     assert done.returncode == 1
     assert done.stderr.strip() == (
@@ -170,7 +170,7 @@ def _refuse(number: int) -> object:
 
 
 @pytest.mark.parametrize("number", [errno.ENOSYS, errno.EINVAL, errno.EPERM])
-def test_a_system_that_refuses_it_to_all_is_told_from_a_right_that_is_missing(
+def test_a_system_that_refuses_it_to_all_is_distinguished_from_a_right_that_is_missing(
     monkeypatch: pytest.MonkeyPatch, number: int
 ) -> None:
     """As musl does (ENOSYS), a sandbox (EINVAL), or a group of processes without time for it (EPERM)."""

@@ -341,7 +341,7 @@ def test_what_slides_is_asked_for_newtons_and_not_for_a_torque() -> None:
     assert Coordinates((Joint("cart", unit="m", turns=False), Joint("pole")), (0, 1)).drive_unit == "N or N m"
 
 
-def test_a_push_that_is_no_number_is_told_with_the_units_of_all_joints() -> None:
+def test_a_push_that_is_no_number_is_reported_with_the_units_of_all_joints() -> None:
     plant = Plant(Coordinates((Joint("cart", unit="m", turns=False), Joint("pole")), (0,)))
     units = {kind: gate.unit for kind, gate in plant.supervisor.gates.items()}
     assert units == {Input.EFFORT_COMMAND: "N", Input.DISTURBANCE: "N", Input.PUSH: "N or N m"}

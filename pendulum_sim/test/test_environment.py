@@ -104,7 +104,7 @@ def test_one_seed_gives_one_episode_and_another_seed_another() -> None:
 
 
 @pytest.mark.parametrize(("start", "angle"), [("top", 0.0), ("bottom", -math.pi)])
-def test_it_starts_where_it_is_told(start: str, angle: float) -> None:
+def test_it_starts_at_the_given_place(start: str, angle: float) -> None:
     x, _ = PlantEnv().reset(seed=0, options={"start": start})
     assert x.tolist() == [angle, 0.0]
 

@@ -277,7 +277,7 @@ def test_an_environment_that_is_odd_is_named_by_what_it_does(tmp_path: Path, odd
 @pytest.mark.parametrize(
     ("delay", "cause"), [(6, "a delay (an effort acts 60 ms later)"), (30, "an effort that does nothing within 200 ms")]
 )
-def test_a_delay_that_the_search_for_an_equation_cannot_see_is_told_and_then_named(
+def test_a_delay_that_the_search_for_an_equation_cannot_see_is_reported_and_then_named(
     tmp_path: Path, delay: int, cause: str
 ) -> None:
     adapter = tmp_path / "adapter.yaml"

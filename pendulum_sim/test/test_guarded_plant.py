@@ -84,7 +84,7 @@ def test_no_torque_is_made_of_a_command_that_is_no_number(kind: str, tmp_path: P
     assert plant.step(0.0).time == pytest.approx(plant.dt)
 
 
-def test_slow_steps_are_told_from_one_pause() -> None:
+def test_slow_steps_are_distinguished_from_one_pause() -> None:
     paused = PaceWatch(0.002)
     for _ in range(300):
         assert paused.problem(0.001, 0.0) == ""

@@ -157,7 +157,7 @@ def test_layouts_show_signals_that_exist() -> None:
     assert called == {f"{plant}/{service}" for plant in ("/sim/simulator", "/hw/bridge") for service in services}
 
 
-def test_the_controller_manager_is_told_our_joint() -> None:
+def test_the_controller_manager_gets_our_joint() -> None:
     path = PROJECT / "pendulum_lqr" / "config" / "ros2_control_controllers.yaml"
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
     assert content["effort_controller"]["ros__parameters"]["joints"] == [names.JOINT]

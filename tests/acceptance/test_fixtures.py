@@ -84,7 +84,7 @@ def test_programs_follow_each_other_in_one_process_unless_they_are_to_be_alone(p
     assert (refused.pid, refused.wait(60.0)) == (one, 2)
 
 
-def test_a_program_that_ignores_the_interrupt_is_killed_and_told(tmp_path: Path) -> None:
+def test_a_program_that_ignores_the_interrupt_is_killed_and_reported(tmp_path: Path) -> None:
     group = ProcessGroup(tmp_path, cwd=PROJECT)
     code = "import signal, time; signal.signal(signal.SIGINT, signal.SIG_IGN); print('deaf'); time.sleep(60)"
     program = group.start_command(python(code), name="deaf")
@@ -93,7 +93,7 @@ def test_a_program_that_ignores_the_interrupt_is_killed_and_told(tmp_path: Path)
     assert not psutil.pid_exists(program.pid)
 
 
-def test_a_process_that_outlives_its_starter_is_killed_and_told(tmp_path: Path) -> None:
+def test_a_process_that_outlives_its_starter_is_killed_and_reported(tmp_path: Path) -> None:
     group = ProcessGroup(tmp_path, cwd=PROJECT)
     code = """
         import subprocess, sys

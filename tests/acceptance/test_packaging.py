@@ -204,7 +204,7 @@ def test_the_list_of_programs_says_what_each_is_for(package: str, program: str) 
     assert len(lines) == len(executables(package))
 
 
-def test_packages_that_cannot_be_had_are_told_in_a_sentence_and_tried_again(tmp_path: Path) -> None:
+def test_packages_that_cannot_be_had_are_reported_in_a_sentence_and_tried_again(tmp_path: Path) -> None:
     shutil.copy(PROJECT / "Makefile", tmp_path)
     (tmp_path / "requirements").mkdir()
     for layer in ("run", "extras", "build", "checks", "docs", "test"):

@@ -58,7 +58,7 @@ def test_the_same_order_is_one_whatever_the_scores_and_the_reverse_is_minus_one(
     assert reverse.chance == 1.0
 
 
-def test_a_perfect_order_of_a_few_designs_is_told_as_what_chance_gives_too():
+def test_a_perfect_order_of_a_few_designs_is_reported_as_what_chance_gives_too():
     few = judged([0.1, 0.3, 0.5], [0.2, 0.3, 0.9])
     assert (few.spearman.low, few.spearman.high) == pytest.approx((1.0, 1.0))
     assert few.chance == pytest.approx(1.0 / 6.0)

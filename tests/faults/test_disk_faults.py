@@ -32,7 +32,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_a_full_disk_is_told_and_what_was_sealed_is_kept(small_disk: Path, storage: str) -> None:
+def test_a_full_disk_is_reported_and_what_was_sealed_is_kept(small_disk: Path, storage: str) -> None:
     bag = small_disk / "bag"
     writer = BagWriter(bag, storage)
     writer.add_topic(_TOPIC, "sensor_msgs/msg/JointState")

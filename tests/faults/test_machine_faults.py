@@ -267,7 +267,7 @@ FAULTS = [
 @pytest.mark.parametrize("plant", ["cart_pole", "double_pendulum"])
 @pytest.mark.parametrize("joint", [0, 1])
 @pytest.mark.parametrize(("fault", "name"), FAULTS)
-def test_a_fault_of_any_joint_ends_all_torque_in_time_and_is_told_by_its_name(
+def test_a_fault_of_any_joint_ends_all_torque_in_time_and_is_reported_by_its_name(
     plant: str, joint: int, fault: ActuatorFault, name: str
 ) -> None:
     machine = held(plant)
@@ -284,7 +284,7 @@ def test_a_fault_of_any_joint_ends_all_torque_in_time_and_is_told_by_its_name(
     assert not any(drive.on for drive in machine.emulated.drives)
 
 
-def test_faults_of_a_cart_are_told_in_metres_and_newtons() -> None:
+def test_faults_of_a_cart_are_reported_in_metres_and_newtons() -> None:
     machine = held()
     machine.emulated.faults[0].add(ActuatorFault.VELOCITY_NAN)
     machine.cycles(20)

@@ -45,7 +45,7 @@ def test_nothing_is_right_long_after_the_last_command_or_by_a_disturbance_alone(
     assert excess(500.0, 1.0, [Asked(503 * MS, 1.0)], []) == pytest.approx(0.8)
 
 
-def test_the_limit_holds_whatever_was_asked_for_and_the_worst_instant_is_told() -> None:
+def test_the_limit_holds_whatever_was_asked_for_and_the_worst_instant_is_reported() -> None:
     commands = [Asked(500 * MS, 100.0)]
     drives = [Drive(505 * MS, 5.1), Drive(510 * MS, 7.2), Drive(515 * MS, 6.2)]
     when, torque = beyond_asked(drives, commands, [], LIMIT)

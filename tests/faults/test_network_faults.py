@@ -60,7 +60,7 @@ print(min(times), lost)
 """
 
 
-def test_cable_delays_and_loses_what_it_is_told_to() -> None:
+def test_cable_delays_and_loses_as_configured() -> None:
     reason = why_not()
     if reason:
         pytest.skip(reason)

@@ -47,7 +47,7 @@ def taken(source: PolledInput) -> int:
     return len(messages)
 
 
-def test_an_input_that_is_watched_is_told_once_of_what_came_and_not_of_what_did_not(
+def test_an_input_that_is_watched_is_notified_once_of_what_came_and_not_of_what_did_not(
     peer: GraphPeer, node: PollingNode, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(arrivals, "_LONGEST_TRUST", 1e6)
@@ -67,7 +67,7 @@ def test_an_input_that_is_watched_is_told_once_of_what_came_and_not_of_what_did_
     assert not source.came()
 
 
-def test_what_waited_before_somebody_watched_is_told(peer: GraphPeer, node: PollingNode) -> None:
+def test_what_waited_before_somebody_watched_is_reported(peer: GraphPeer, node: PollingNode) -> None:
     states = peer.node.create_publisher(JointState, "states", qos.STATE)
     source = node.create_polled_input(JointState, "states", qos.COMMAND_INPUT)
     wait_for(lambda: states.get_subscription_count() == 1, 30.0, "the match")

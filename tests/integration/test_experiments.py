@@ -180,7 +180,7 @@ def test_a_lockstep_run_is_waited_for_as_long_as_it_goes_on_and_no_longer(
     assert came[-1] < 10
 
 
-def test_a_run_of_which_the_recorder_was_told_nothing_on_a_topic_fails_and_names_it(
+def test_a_run_of_which_the_recorder_received_nothing_on_a_topic_fails_and_names_it(
     tmp_path: Path, hosts: HostPool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It knows of a publisher that does not know of it yet: what that says goes to nobody."""

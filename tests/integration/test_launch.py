@@ -74,7 +74,7 @@ def test_both_plants_differ_by_namespace_only_for_controller_and_disturbance() -
     assert periods == {"/sim": 0.002, "/hw": 0.01}
 
 
-def test_a_real_actuator_is_never_told_where_it_stands() -> None:
+def test_a_real_actuator_is_never_given_its_position() -> None:
     bridge = programs({**DEFAULTS, **LAB, "plant": "hebi", "start": "top"})[0]
     assert bridge.parameters == {"lab_file": LAB["lab"], "feedback_rate": 100.0}
 

@@ -87,7 +87,7 @@ def test_what_breaks_a_session_off_disarms_a_plant_that_it_drives_and_no_other(
     assert [child.process.poll() is not None for child in ended] == [True, True]
 
 
-def test_a_move_that_a_stopped_plant_refuses_is_told_by_what_stopped_it(
+def test_a_move_that_a_stopped_plant_refuses_is_reported_by_what_stopped_it(
     processes: ProcessGroup, domain_id: int, tmp_path: Path
 ) -> None:
     processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim")

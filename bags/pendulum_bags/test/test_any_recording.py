@@ -227,7 +227,7 @@ def test_a_part_of_a_file_of_several_runs_is_chosen_by_its_number(tmp_path: Path
         np.testing.assert_allclose(second.position, 0.5 * RUN["position"])
 
 
-def test_a_plant_that_turns_one_way_is_told_from_its_clock_by_its_steps(tmp_path: Path) -> None:
+def test_a_plant_that_turns_one_way_is_distinguished_from_its_clock_by_its_steps(tmp_path: Path) -> None:
     """The layout of a motor's step response: counter, pulse width, microseconds, angle."""
     t = 5080e-6 * np.arange(200) + 1e-5 * np.random.default_rng(0).random(200)
     rows = np.stack([np.arange(200), np.full(200, 100), 1e6 * t, 6.0 * (t - 0.2 * (1.0 - np.exp(-t / 0.2)))], axis=1)
@@ -417,7 +417,7 @@ def test_a_position_that_stands_still_is_named(tmp_path: Path) -> None:
         ({"a": RUN["position"], "b": RUN["torque"], "t": RUN["t"]}, r"plainly the position; expected names .*a \("),
     ],
 )
-def test_what_cannot_be_told_is_refused_with_what_there_is(tmp_path: Path, arrays: Any, words: str) -> None:
+def test_what_cannot_be_determined_is_refused_with_what_there_is(tmp_path: Path, arrays: Any, words: str) -> None:
     np.savez(tmp_path / "run.npz", **arrays)
     with pytest.raises(DataError, match=words):
         Reading(tmp_path / "run.npz").rules  # noqa: B018

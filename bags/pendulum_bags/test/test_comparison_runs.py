@@ -225,7 +225,7 @@ def test_states_that_are_missing_count_as_missed_deadlines() -> None:
     assert missed_periods(stamps) == 3
 
 
-def test_a_run_that_lost_many_states_is_told_apart_from_a_sound_one(folder: Path) -> None:
+def test_a_run_that_lost_many_states_is_distinguished_from_a_sound_one(folder: Path) -> None:
     plants = compare_folders([folder]).plants
     assert timing_warning(plants) == ""
     disturbed = {**plants, "sim": {**plants["sim"], "samples": 2384, "missed_deadlines": 116}}

@@ -223,7 +223,7 @@ def test_what_does_not_exist_or_has_an_unknown_suffix_is_refused(tmp_path):
         read_recording(tmp_path / "data.xyz")
 
 
-def test_a_hebi_log_that_cannot_be_read_is_told_by_the_program_that_reads_it(tmp_path):
+def test_a_hebi_log_that_cannot_be_read_is_reported_by_the_program_that_reads_it(tmp_path):
     (tmp_path / "hw.hebilog").write_bytes(b"no log")
     with refused("is no HEBI log"):
         read_recording(tmp_path / "hw.hebilog")

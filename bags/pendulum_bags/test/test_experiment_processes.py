@@ -37,7 +37,7 @@ def _message(folder: Path, program: str = _LOGS_AND_ENDS) -> str:
     return str(caught.value)
 
 
-def test_what_a_node_logs_and_then_ends_with_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_node_logs_and_then_ends_with_is_reported_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "getloadavg", lambda: (0.1, 0.1, 0.1))
     assert _message(tmp_path) == (
         "hw_bridge ended with code 2; its last output: error: actuator thread did not answer within 30 s"

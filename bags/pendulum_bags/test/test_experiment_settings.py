@@ -60,7 +60,7 @@ def test_a_plant_with_motor_and_spring_is_not_stepped_by_the_thesis_s_integrator
         assert make_pendulum(load_plant("x5_9"), 0.002, method=settings.method).state.theta == 0.0
 
 
-def test_ramps_are_the_thesis_s_unless_told_and_told_slower_or_faster_in_all_that_they_are() -> None:
+def test_ramps_are_the_thesis_s_by_default_and_on_request_slower_or_faster_in_all_that_they_are() -> None:
     usual = RegulationSettings()
     assert usual.ramp(0.1, UPRIGHT) == thesis_ramp(0.1, UPRIGHT)
     assert usual.expected_wall_time == 47.0 + 5.0

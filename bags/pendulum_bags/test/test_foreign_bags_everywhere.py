@@ -78,7 +78,7 @@ def stepping_back(seconds: float, since_ns: int) -> Callable[[Message], Message]
 
 
 @pytest.mark.parametrize("seconds", [0.053, 1.7, 5.3])
-def test_a_clock_that_stepped_back_changes_no_comparison_and_is_told(
+def test_a_clock_that_stepped_back_changes_no_comparison_and_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], seconds: float
 ) -> None:
     sim, sound = EXAMPLES / "regulation_sim", EXAMPLES / "regulation_hw"

@@ -286,7 +286,7 @@ def test_two_machines_in_one_table_are_refused(tmp_path):
 
 
 @pytest.mark.parametrize("drop", [False, True])
-def test_a_column_without_any_number_is_not_told_to_drop_rows(tmp_path, drop):
+def test_a_column_without_any_number_is_not_advised_to_drop_rows(tmp_path, drop):
     table = rows(TIME, ANGLE, SPEED, np.full(TIME.size, np.nan))
     path = save(tmp_path / "run.csv", "time,position,velocity,torque\n" + table)
     with pytest.raises(DataError, match=r"column 'torque' holds no number at all; .*: name another one$"):

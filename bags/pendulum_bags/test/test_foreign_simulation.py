@@ -95,7 +95,7 @@ def test_a_model_that_cannot_take_part_is_refused_before_anything_starts(
         RegulationSettings(simulation=str(model))
 
 
-def test_a_weak_environment_is_told_what_its_adapter_file_takes() -> None:
+def test_a_weak_environment_is_reported_with_what_its_adapter_file_takes() -> None:
     pytest.importorskip("gymnasium")
     with pytest.raises(
         ParameterError, match=r"expected more torque, as set, on the attribute that limits it, in a map"

@@ -126,7 +126,7 @@ def test_the_same_plant_at_two_rates_shows_no_difference(measured):
         np.testing.assert_allclose(continuous(measured[side], linearise(THESIS))[1], true[1], rtol=0.03)
 
 
-def test_a_delay_and_a_gain_are_found_and_told_apart(measured):
+def test_a_delay_and_a_gain_are_found_and_distinguished(measured):
     difference = compare_responses(measured["sim"], measured["other"], linearise(THESIS))
     assert difference.found
     assert difference.delay.value == pytest.approx(0.01, abs=2e-4)

@@ -91,7 +91,7 @@ def test_one_trial_has_intervals_that_hold_the_truth_whatever_the_memory_of_its_
     assert (np.mean(independent) < 0.5) == (memory > 1.0)
 
 
-def test_a_loop_that_the_regression_leaves_out_widens_the_interval_and_is_told():
+def test_a_loop_that_the_regression_leaves_out_widens_the_interval_and_is_reported():
     trial = hand_trial(1)
     clean = fit_inertia_damping([trial])
     loop = 0.05 * np.sign(np.gradient(trial.velocity, trial.time))

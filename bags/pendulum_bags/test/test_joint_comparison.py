@@ -128,7 +128,7 @@ def told(capsys: pytest.CaptureFixture[str], *arguments: Any) -> dict[str, Any]:
     return content
 
 
-def test_the_same_plant_twice_is_told_alike_in_every_joint(
+def test_the_same_plant_twice_is_reported_alike_in_every_joint(
     bags: dict[str, Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with each_read_once(bags["sim"], bags["alike"]):
@@ -147,7 +147,7 @@ def test_the_same_plant_twice_is_told_alike_in_every_joint(
     assert plants == {"cart_pole."}
 
 
-def test_another_plant_is_told_by_the_joint_that_shows_it(
+def test_another_plant_is_reported_by_the_joint_that_shows_it(
     bags: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     content = told(capsys, bags["sim"], bags["other"], "-o", tmp_path)

@@ -30,7 +30,7 @@ def test_a_chunk_depends_on_settings_and_index_alone() -> None:
     assert not np.array_equal(first["max_pole"], run_chunk(SMALL, 0)["max_pole"])
 
 
-def test_parameters_scatter_as_told_about_their_value() -> None:
+def test_parameters_scatter_as_configured_about_their_value() -> None:
     drawn = run_chunk(replace(SMALL, runs=20_000, chunk=20_000, duration=0.01), 0)
     plant = load_mechanism("cart_pole")
     for name, share in SHARES.items():

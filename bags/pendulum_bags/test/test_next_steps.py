@@ -90,7 +90,7 @@ def test_other_layers_are_measured_of_the_plants_that_were_compared(
 @pytest.mark.parametrize(
     "command", [f"{THESIS} --hardware hebi", f"{THESIS} --simulation ros:/lab --plant x", "by hand"]
 )
-def test_no_experiment_on_the_emulator_is_told_to_measure_another_machine(command: str) -> None:
+def test_no_experiment_on_the_emulator_is_advised_to_measure_another_machine(command: str) -> None:
     assert measurement_of([{"command": command}], "ranking") == ""
 
 
@@ -125,7 +125,7 @@ def test_a_record_without_a_command_tells_no_experiment() -> None:
     assert next_test_of([], "my.yaml") == ""
 
 
-def test_the_experiment_takes_the_options_of_the_command_that_is_told() -> None:
+def test_the_experiment_takes_the_options_of_the_command_that_is_reported() -> None:
     told = shlex.split(next_test_of([{"command": f"{THESIS} --hardware hebi"}], "my file.yaml"))
     assert told[-4:] == ["--plant", "my file.yaml", "--seed", "2"]
     command = typer.main.get_command(experiment_app).commands["thesis"]  # type: ignore[attr-defined]

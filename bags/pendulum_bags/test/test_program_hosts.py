@@ -175,7 +175,7 @@ def test_a_program_ends_with_the_code_and_the_words_that_it_would_have_alone(
     # Without a word, code 0 is no success.
     [(("kills",), -signal.SIGKILL), (("exits", "9"), 9), (("exits", "0"), 1)],
 )
-def test_a_program_that_takes_its_host_with_it_is_told_and_the_next_has_another(
+def test_a_program_that_takes_its_host_with_it_is_reported_and_the_next_has_another(
     pool: HostPool, tmp_path: Path, words: tuple[str, ...], code: int
 ) -> None:
     ended = _start(pool, tmp_path / "log", *words)

@@ -54,7 +54,7 @@ def test_mmrv_is_its_definition(costs):
     assert mmrv(hw, hw) == 0.0
 
 
-def test_a_simulation_that_orders_all_is_told_so():
+def test_a_simulation_that_orders_all_is_reported_so():
     found = rank([contender(f"c{i}", cost, 1.1 * cost) for i, cost in enumerate((1.0, 2.0, 3.0, 5.0, 8.0))])
     assert found.srcc.value == pytest.approx(1.0)
     assert found.spearman == pytest.approx(1.0)

@@ -193,7 +193,7 @@ def test_the_longest_name_of_a_term_wins_and_text_stays_text() -> None:
     assert "standard deviation" not in Terms().mark("stdout")
 
 
-def test_page_escapes_what_it_is_told(page: Path) -> None:
+def test_page_escapes_its_texts(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     assert "&lt;/script&gt;" in text
     assert text.count("</script>") == 4
@@ -300,7 +300,7 @@ def test_two_bags_make_a_report_too(folder: Path, tmp_path: Path, monkeypatch: p
     assert not (tmp_path / "report" / "figures" / "replay.png").exists()
 
 
-def test_two_bags_of_one_name_are_told_apart_in_the_title() -> None:
+def test_two_bags_of_one_name_are_distinguished_in_the_title() -> None:
     assert title_of([Path("/x/mon/sim"), Path("/x/tue/sim")], 1) == "mon/sim and tue/sim"
     assert title_of([Path("/x/mon"), Path("/x/tue")], 2) == "2 runs"
 

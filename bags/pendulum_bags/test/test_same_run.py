@@ -103,7 +103,7 @@ def test_every_test_can_fail_alone() -> None:
 
 
 @pytest.mark.parametrize("late", [0.3, -0.3])
-def test_a_delay_beyond_all_that_is_looked_at_is_not_told_as_the_last_of_it(late: float) -> None:
+def test_a_delay_beyond_all_that_is_looked_at_is_not_reported_as_the_last_of_it(late: float) -> None:
     """Where the likeness still grows at the end of the search there is no peak, and no delay that could be stated."""
     rng = np.random.default_rng(4)
     t = np.arange(0.0, 40.0, 0.005)
@@ -118,7 +118,7 @@ def test_a_delay_beyond_all_that_is_looked_at_is_not_told_as_the_last_of_it(late
 
 
 @pytest.mark.parametrize("late", [0.12, 0.2])
-def test_a_machine_far_too_late_is_not_told_to_be_early_by_a_chance_peak(late: float) -> None:
+def test_a_machine_far_too_late_is_not_reported_to_be_early_by_a_chance_peak(late: float) -> None:
     found = compare([pair(5, late=late)])
     assert outcomes(found)["delay"] is Outcome.UNDECIDED
     assert found.verdict.outcome is Outcome.DIFFERENT
@@ -127,7 +127,7 @@ def test_a_machine_far_too_late_is_not_told_to_be_early_by_a_chance_peak(late: f
     assert "later" not in reason
 
 
-def test_no_delay_is_told_as_none_in_every_place_and_lies_within_no_margin() -> None:
+def test_no_delay_is_reported_as_none_in_every_place_and_lies_within_no_margin() -> None:
     found = compare([pair(3, late=0.09)], margin={"delay": "150 ms"})
     tested = next(test for test in found.verdict.tests if test.quantity == "delay")
     assert tested.outcome is Outcome.UNDECIDED

@@ -37,7 +37,7 @@ def failing(folder: Path, errors: list[FaultError | None]) -> Callable[[], None]
     return run
 
 
-def test_a_stalled_run_is_told_and_carried_out_again_in_a_clean_folder(tmp_path: Path) -> None:
+def test_a_stalled_run_is_reported_and_carried_out_again_in_a_clean_folder(tmp_path: Path) -> None:
     said: list[str] = []
     run_undisturbed(failing(tmp_path, [STALL, None]), tmp_path, emulated=True, tell=said.append)
     assert said == [f"This machine stood still ({STALL}); measuring again, run 2 of at most 3."]
@@ -75,7 +75,7 @@ def test_what_a_stalled_run_left_outlives_an_end_of_the_next_one_that_records_no
     assert discard_if_empty(create_run_folder(tmp_path / "other", "thesis"))
 
 
-def test_runs_that_broke_off_are_told_by_the_comparison_the_terminal_and_the_report(
+def test_runs_that_broke_off_are_reported_by_the_comparison_the_terminal_and_the_report(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "run"

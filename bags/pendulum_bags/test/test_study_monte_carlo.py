@@ -45,7 +45,7 @@ def test_a_chunk_depends_on_settings_and_index_alone() -> None:
     assert len(run_chunk(SMALL, 2)["max_theta"]) == 100
 
 
-def test_parameters_scatter_as_told_and_stay_positive() -> None:
+def test_parameters_scatter_as_configured_and_stay_positive() -> None:
     drawn = draw_chunk(replace(SMALL, runs=200_000, chunk=200_000), 0)
     assert drawn["damping"].mean() == pytest.approx(11.77, rel=1e-3)
     assert drawn["damping"].std() == pytest.approx(0.05 * 11.77, rel=1e-2)

@@ -19,7 +19,7 @@ def result(layer: Layer, mark: Mark, **more: Any) -> LayerResult:
     return LayerResult(layer, mark, f"{layer.title} says {mark.value}.", (row,), steps, **more)
 
 
-def test_one_layer_that_says_no_makes_it_no_and_what_another_certifies_is_still_told() -> None:
+def test_one_layer_that_says_no_makes_it_no_and_what_another_certifies_is_still_reported() -> None:
     answer = sum_up(
         [
             result(

@@ -73,7 +73,7 @@ def test_a_simulated_run_of_a_ranking_is_read_back_as_a_run_of_a_study(tmp_path:
     assert collect_contenders([tmp_path])[0] == []
 
 
-def test_recordings_are_made_one_after_the_other_and_a_failure_is_told_by_its_own_bag_alone(tmp_path: Path) -> None:
+def test_recordings_are_made_one_after_the_other_and_a_failure_is_reported_by_its_own_bag_alone(tmp_path: Path) -> None:
     first, second, third = (RunSpec(disturbance=NOISE, duration=0.2, seed=seed) for seed in (1, 2, 3))
     runs = [MachineRun(tmp_path / name, spec) for name, spec in (("a", first), ("b", second), ("c", third))]
     record_simulation(tmp_path / "b", first)

@@ -126,7 +126,7 @@ def test_a_changed_message_index_is_refused_and_repair_loses_nothing(sound: Path
         }
 
 
-def test_a_changed_summary_is_told_and_the_chunks_are_found_without_it(sound: Path, tmp_path: Path) -> None:
+def test_a_changed_summary_is_reported_and_the_chunks_are_found_without_it(sound: Path, tmp_path: Path) -> None:
     (file,) = sound.glob("*.mcap")
     summary = int.from_bytes(file.read_bytes()[-28:-20], "little")
     content = file.read_bytes()
@@ -148,7 +148,7 @@ def test_chunks_of_a_file_that_was_not_closed_are_compared_when_it_is_opened(tmp
     assert read_bag(bag).load().damage == read_bag(bag, verify=False).damage, "a sound one has no more damage than that"
 
 
-def test_a_changed_summary_of_a_file_that_was_not_closed_is_told(tmp_path: Path) -> None:
+def test_a_changed_summary_of_a_file_that_was_not_closed_is_reported(tmp_path: Path) -> None:
     """Any byte of it: a name, a type, a count, a time."""
     states = ((TOPICS[index % 3], index, encode_joint_state(index)) for index in range(30))
     bag = write_bag(tmp_path / "bag", states, seal_every=10, close=False)
@@ -207,7 +207,7 @@ def test_a_summary_that_the_recorder_replaces_while_it_is_read_is_read_again(
     writer.close()
 
 
-def test_damage_is_told_each_time_that_it_is_read(sound: Path, tmp_path: Path) -> None:
+def test_damage_is_reported_each_time_that_it_is_read(sound: Path, tmp_path: Path) -> None:
     opened = read_bag(with_flip(sound, tmp_path / "flipped", inside(sound)))
     for _ in range(2):
         for topic in TOPICS:
@@ -238,7 +238,7 @@ def test_a_pass_that_is_held_open_ends_with_its_file_and_so_does_its_thread(tmp_
         list(going)
 
 
-def test_an_index_that_names_what_is_not_there_is_told_with_file_chunk_topic_and_time(
+def test_an_index_that_names_what_is_not_there_is_reported_with_file_chunk_topic_and_time(
     sound: Path, tmp_path: Path
 ) -> None:
     chunk = source_of(sound).chunks[1]

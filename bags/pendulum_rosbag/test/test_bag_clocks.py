@@ -101,7 +101,7 @@ def test_a_late_message_and_a_file_in_no_order_are_no_steps() -> None:
     assert steps_back(np.concatenate([times, times - 200_000_000 + 10**9])) == [100]
 
 
-def test_a_small_step_back_is_told_from_late_and_early_messages() -> None:
+def test_a_small_step_back_is_distinguished_from_late_and_early_messages() -> None:
     times = np.arange(1000) * 2_000_000
     stepped = np.concatenate([times[:500], times[500:] - 20_000_000])
     assert steps_back(stepped) == [500]

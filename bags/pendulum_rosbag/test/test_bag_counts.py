@@ -96,7 +96,7 @@ def test_an_index_that_names_a_message_twice_is_refused_and_repair_loses_nothing
 
 
 @pytest.mark.parametrize("alone", [False, True], ids=["folder", "file"])
-def test_a_row_that_is_no_message_any_more_is_told(tmp_path: Path, alone: bool) -> None:
+def test_a_row_that_is_no_message_any_more_is_reported(tmp_path: Path, alone: bool) -> None:
     """A database has no checksums; one byte in the head of a row hides it from every reader."""
     bag = write(tmp_path / "bag", "sqlite3")
     file = file_of(bag)
@@ -115,7 +115,7 @@ def test_a_row_that_is_no_message_any_more_is_told(tmp_path: Path, alone: bool) 
 @pytest.mark.parametrize(
     "change", ["DELETE FROM messages WHERE id = 5", "UPDATE messages SET topic_id = 2 WHERE id = 5"]
 )
-def test_fewer_messages_than_the_metadata_names_are_told(tmp_path: Path, change: str, alone: bool) -> None:
+def test_fewer_messages_than_the_metadata_names_are_reported(tmp_path: Path, change: str, alone: bool) -> None:
     bag = write(tmp_path / "bag", "sqlite3")
     connection = sqlite3.connect(file_of(bag))
     connection.execute(change)

@@ -236,7 +236,7 @@ def test_a_topic_that_nobody_publishes_is_named_and_fails(
 @pytest.mark.parametrize(
     ("log_time", "settling", "kind"), [("receive", 0.0, "early"), ("header", 0.0, "early"), ("receive", 60.0, "before")]
 )
-def test_a_topic_whose_beginning_was_missed_is_announced_before_that_is_told(
+def test_a_topic_whose_beginning_was_missed_is_announced_before_that_is_reported(
     tmp_path: Path, domain_id: int, monkeypatch: pytest.MonkeyPatch, log_time: str, settling: float, kind: str
 ) -> None:
     """Messages without a stamp wait for the first that has one: till then the bag does not know their topic."""
@@ -272,7 +272,7 @@ def test_a_topic_whose_beginning_was_missed_is_announced_before_that_is_told(
         rclpy.shutdown()
 
 
-def test_what_is_missed_while_a_topic_is_subscribed_to_anew_is_told(
+def test_what_is_missed_while_a_topic_is_subscribed_to_anew_is_reported(
     tmp_path: Path, domain_id: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A publisher that offers less joins: its topic is subscribed to anew, while the others go on publishing."""

@@ -243,7 +243,7 @@ def test_a_truncated_sqlite_file_gives_back_the_rows_on_its_pages(tmp_path: Path
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_random_damage_is_refused_or_told_and_what_is_read_was_written(tmp_path: Path, storage: str) -> None:
+def test_random_damage_is_refused_or_reported_and_what_is_read_was_written(tmp_path: Path, storage: str) -> None:
     rng = random.Random(13)
     bag = our_bag(tmp_path / storage, storage)
     file = storage_file(bag)

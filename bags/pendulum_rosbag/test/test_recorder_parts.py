@@ -134,7 +134,7 @@ def test_a_full_queue_refuses_and_counts(tmp_path: Path) -> None:
     assert read_bag(tmp_path / "bag").metadata["pendulum.recorder.counts"]["/a"]["lost"] == refused
 
 
-def test_messages_before_the_subscription_was_complete_are_told_and_are_no_loss(tmp_path: Path) -> None:
+def test_messages_before_the_subscription_was_complete_are_reported_and_are_no_loss(tmp_path: Path) -> None:
     session = RecordingSession(BagWriter(tmp_path / "bag"))
     session.add_topic("/a", message_type(JOINT_STATE), ())
     session.offer("/a", [(1, encode_joint_state(1, position=1.0))])
