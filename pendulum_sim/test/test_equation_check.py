@@ -13,6 +13,7 @@ import pytest
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import (
+    PlantParameters,
     load_mechanism,
     load_plant,
     pendulum_plant,
@@ -157,7 +158,7 @@ def test_two_features_are_both_named(tmp_path: Path) -> None:
 
 def test_the_log_holds_the_equation_that_a_controller_is_designed_on(tmp_path: Path) -> None:
     made = open_simulation(str(write_model(tmp_path / "model.xml", "motor_delay")))
-    found = made.pendulum.parameters
+    found = made.plant.parameters
     (line,) = [remark for remark in made.remarks if remark.startswith("closest equation: ")]
     for name, unit in (("inertia", "kg m^2"), ("gravity", "N m"), ("transport_delay", "s"), ("effort_limit", "N m")):
         assert f"{name} {getattr(found, name):.6g} {unit}" in line
@@ -317,3 +318,99 @@ def test_several_joints_are_judged_one_by_one(name: str) -> None:
     found = check_equation(softer, other)
     assert not found.agrees
     assert found.errors[last] > TOLERANCE
+
+
+# --- several joints --------------------------------------------------------------------------------------------
+
+
+def _acrobot(**changes: float) -> PlantParameters:
+    """Return an acrobot whose equation a model file of two plain links has."""
+    return load_mechanism("acrobot_frictionless").with_values({"rotor_inertia": 0.0, "elbow.damping": 0.02, **changes})
+
+
+def write_arm(folder: Path, plant: PlantParameters, elbow: str = "") -> tuple[str, str, str]:
+    """Write an arm as others do: it stands at 0, clockwise, with names of its own; return model, mapping and plant."""
+    (m_1, l_1, r_1, i_1), (m_2, _, r_2, i_2) = plant.values[:4], plant.values[4:8]
+    own = [f'diaginertia="{i - m * r * r} {i - m * r * r} 1e-5"' for i, m, r in ((i_1, m_1, r_1), (i_2, m_2, r_2))]
+    damping = [joint.damping for joint in plant.joints]
+    model = folder / "arm.xml"
+    model.write_text(
+        '<mujoco><option timestep="0.001" integrator="implicitfast"/><worldbody><body pos="0 0 1">'
+        f'<joint name="hip" axis="0 1 0" damping="{damping[0]}"/>'
+        f'<inertial pos="0 0 {r_1}" mass="{m_1}" {own[0]}/><body pos="0 0 {l_1}">'
+        f'<joint name="knee" axis="0 1 0" damping="{damping[1]}" {elbow}/>'
+        f'<inertial pos="0 0 {r_2}" mass="{m_2}" {own[1]}/></body></body></worldbody>'
+        '<actuator><motor joint="knee" gear="2" ctrlrange="-2 2"/></actuator></mujoco>',
+        encoding="utf-8",
+    )
+    mapping = folder / "arm.yaml"
+    mapping.write_text(
+        "format: pendulum_simulation/1\n"
+        "joints:\n  shoulder: {joint: hip, sign: -1}\n  elbow: {joint: knee, sign: -1}\n",
+        encoding="utf-8",
+    )
+    return str(model), str(mapping), str(write_plant(folder / "plant.yaml", plant))
+
+
+def test_an_arm_of_others_is_a_plant_of_two_joints_with_the_limit_of_its_own_motor(tmp_path: Path) -> None:
+    made = open_simulation(*write_arm(tmp_path, _acrobot()))
+    assert made.plant.parameters.effort_limits == (4.0,)
+    assert "its 3.14159 rad are our 0, turned round" in made.remarks[0]
+    assert "'knee' through actuator" in made.remarks[1]
+    assert made.check is not None
+    found = made.check()
+    assert found.agrees, str(found)
+    assert found.joints == ("shoulder", "elbow")
+
+
+@pytest.mark.parametrize("name", ["cart_pole", "furuta", "reaction_wheel", "triple_pendulum"])
+def test_exported_mechanisms_need_no_mapping_and_hang_at_zero(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "own.xml"
+    path.write_text(mjcf(load_mechanism(name)), encoding="utf-8")
+    made = open_simulation(str(path), plant=name)
+    assert made.plant.parameters == load_mechanism(name)
+    assert made.check is not None
+    assert made.check().agrees, str(made.check())
+    assert all("are our 0;" in remark for remark in made.remarks[: len(made.plant.parameters.joints)])
+    path.write_text(_renamed(path, name), encoding="utf-8")
+    again = open_simulation(str(path), plant=name)
+    assert again.check is not None
+    assert again.check().agrees, "the joints count in their order, and 0 is where they hang"
+
+
+def _renamed(path: Path, name: str) -> str:
+    text = path.read_text(encoding="utf-8")
+    for joint in load_mechanism(name).coordinates.names:
+        text = text.replace(f'name="{joint}"', f'name="their_{joint}"').replace(
+            f'joint="{joint}"', f'joint="their_{joint}"'
+        )
+    return text
+
+
+def test_another_equation_of_two_joints_is_refused_with_its_joint_and_a_tested_cause(tmp_path: Path) -> None:
+    model, mapping, _ = write_arm(tmp_path, _acrobot(), 'range="-40 40"')
+    check = open_simulation(model, mapping, str(tmp_path / "plant.yaml")).check
+    assert check is not None
+    found = check()
+    assert (found.agrees, found.causes) == (False, ("the range of a joint",)), str(found)
+    heavier = write_plant(tmp_path / "heavier.yaml", _acrobot(mass_2=0.9))
+    check = open_simulation(*write_arm(tmp_path, _acrobot())[:2], str(heavier)).check
+    assert check is not None
+    assert not check().agrees
+
+
+def test_a_model_with_other_joints_than_the_plant_is_refused_in_one_sentence(tmp_path: Path) -> None:
+    model, mapping, _ = write_arm(tmp_path, _acrobot())
+    for plant, sentence in (
+        (
+            "cart_pole",
+            r"has the joints hip \[rad\], knee \[rad\]; expected those of cart_pole, cart \[m\], pole \[rad\]",
+        ),
+        ("thesis", "plant is thesis, of one joint, whose equation is found; expected one of several, or none"),
+    ):
+        with pytest.raises(ParameterError, match=sentence):
+            open_simulation(model, plant=plant)
+    with pytest.raises(ParameterError, match=r"joints: unknown parameter 'shoulder'"):
+        open_simulation(model, mapping, "cart_pole")
+    with pytest.raises(ParameterError, match=r"has 2 hinges \(hip, knee\); expected one"):
+        open_simulation(model)

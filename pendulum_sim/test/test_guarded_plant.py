@@ -16,8 +16,8 @@ from pendulum_sim.exports.model_files import mjcf
 from pendulum_sim.foreign.guarded_plant import GuardedPlant, PaceWatch, StallWatch
 from pendulum_sim.foreign.gymnasium_plant import load_gymnasium_plant
 from pendulum_sim.foreign.mujoco_plant import load_mujoco_plant
-from pendulum_sim.stepping.plant import Plant, PlantState, RigidPlant
-from pendulum_sim.stepping.plants import make_pendulum
+from pendulum_sim.stepping.plant import PlantState, RigidPlant
+from pendulum_sim.stepping.plants import JointPlant, OneJoint, make_plant
 
 
 class Broken(RigidPlant):
@@ -49,26 +49,26 @@ def test_nothing_but_a_fault_gets_out(odd: object, sentence: str) -> None:
     plant = Broken(load_plant("thesis"), 0.002)
     plant.odd = odd
     with pytest.raises(FaultError, match=sentence):
-        GuardedPlant(plant, "lab").step(0.0)
+        GuardedPlant(OneJoint(plant), "lab").step((0.0,), (0.0,))
 
 
 def test_a_sound_plant_passes_unchanged() -> None:
-    one, other = (RigidPlant(load_plant("thesis"), 0.002) for _ in range(2))
+    one, other = (make_plant(load_plant("thesis"), 0.002) for _ in range(2))
     guarded = GuardedPlant(one, "lab")
-    assert guarded.reset(1.0) == other.reset(1.0)
-    assert guarded.step(0.3, 0.1) == other.step(0.3, 0.1) == guarded.state
+    assert guarded.reset((1.0,), (0.0,)) == other.reset((1.0,), (0.0,))
+    assert guarded.step((0.3,), (0.1,)) == other.step((0.3,), (0.1,)) == guarded.state
 
 
-def _mujoco(folder: Path) -> Plant:
+def _mujoco(folder: Path) -> JointPlant:
     pytest.importorskip("mujoco")
     (folder / "lab.xml").write_text(mjcf(load_plant("thesis")), encoding="utf-8")
     return load_mujoco_plant(folder / "lab.xml")
 
 
-_PLANTS: dict[str, Callable[[Path], Plant]] = {
-    "rigid": lambda _: make_pendulum(load_plant("thesis"), 0.002),
-    "series_elastic": lambda _: make_pendulum(load_plant("x5_9"), 0.002),
-    "gymnasium": lambda _: load_gymnasium_plant("Pendulum-v1"),
+_PLANTS: dict[str, Callable[[Path], JointPlant]] = {
+    "rigid": lambda _: make_plant(load_plant("thesis"), 0.002),
+    "series_elastic": lambda _: make_plant(load_plant("x5_9"), 0.002),
+    "gymnasium": lambda _: OneJoint(load_gymnasium_plant("Pendulum-v1")),
     "mujoco": _mujoco,
 }
 
@@ -76,12 +76,12 @@ _PLANTS: dict[str, Callable[[Path], Plant]] = {
 @pytest.mark.parametrize("kind", _PLANTS)
 def test_no_torque_is_made_of_a_command_that_is_no_number(kind: str, tmp_path: Path) -> None:
     plant = _PLANTS[kind](tmp_path)
-    start = plant.reset(0.3, 0.2)
+    start = plant.reset((0.3,), (0.2,))
     for effort, push in ((math.nan, 0.0), (math.inf, 0.0), (0.0, math.nan), (0.0, -math.inf)):
         with pytest.raises(ParameterError, match=f"effort is {effort} N m and push {push} N m; expected finite"):
-            plant.step(effort, push)
+            plant.step((effort,), (push,))
         assert plant.state == start
-    assert plant.step(0.0).time == pytest.approx(plant.dt)
+    assert plant.step((0.0,), (0.0,)).time == pytest.approx(plant.dt)
 
 
 def test_slow_steps_are_distinguished_from_one_pause() -> None:

@@ -12,10 +12,10 @@ import pytest
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_sim.exports.model_files import mjcf, urdf
-from pendulum_sim.foreign.mujoco_mapping import MujocoMapping, load_mujoco_mapping
-from pendulum_sim.foreign.mujoco_plant import MujocoPlant, load_mujoco_plant
+from pendulum_sim.foreign.mujoco_mapping import JointMapping, MujocoMapping, load_mujoco_mapping
+from pendulum_sim.foreign.mujoco_plant import load_mujoco_plant
 from pendulum_sim.stepping.plant import RigidPlant
-from pendulum_sim.stepping.plants import make_pendulum
+from pendulum_sim.stepping.plants import JointPlant, OneJoint, make_plant
 
 pytest.importorskip("mujoco")
 
@@ -60,9 +60,9 @@ def write(
     return path
 
 
-def run(plant: MujocoPlant | RigidPlant, theta: float, effort: float, push: float = 0.0) -> list[float]:
-    plant.reset(theta, 0.0)
-    return [plant.step(effort, push).theta for _ in range(250)]
+def run(plant: JointPlant, theta: float, effort: float, push: float = 0.0) -> list[float]:
+    plant.reset((theta,), (0.0,))
+    return [plant.step((effort,), (push,)).position[0] for _ in range(250)]
 
 
 def test_the_pendulums_equation_and_its_zero_are_read_off_the_file(tmp_path: Path) -> None:
@@ -81,13 +81,13 @@ def test_the_pendulums_equation_and_its_zero_are_read_off_the_file(tmp_path: Pat
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("actuator", ["", "none"])
 def test_it_moves_as_that_equation_says(tmp_path: Path, actuator: str, sign: int) -> None:
-    mapping = MujocoMapping(actuator=actuator, sign=sign, effort_limit=8.0)
+    mapping = MujocoMapping(JointMapping(actuator=actuator, sign=sign, effort_limit=8.0))
     theirs = load_mujoco_plant(write(tmp_path, timestep=0.0002), mapping)
-    ours = RigidPlant(theirs.parameters, theirs.dt)
+    ours = OneJoint(RigidPlant(theirs.parameters, theirs.dt))
     for effort in (0.0, 2.5, -7.0, 30.0):
         # Past the limit only a push acts: 30 N m of command are 8, 1 N m by hand are 1.
         assert run(theirs, 2.0, effort, 1.0) == pytest.approx(run(ours, 2.0, effort, 1.0), abs=2e-3)
-        assert theirs.state.effort == pytest.approx(max(-8.0, min(8.0, effort)))
+        assert theirs.state.effort[0] == pytest.approx(max(-8.0, min(8.0, effort)))
 
 
 @pytest.mark.parametrize("name", ["thesis", "x5_9", "dfki"])
@@ -104,7 +104,7 @@ def test_an_exported_model_needs_no_mapping(tmp_path: Path, name: str, write_mod
             assert getattr(plant.parameters, value) == pytest.approx(getattr(parameters, value), rel=5e-4), value
     if write_model is mjcf:
         assert plant.parameters.effort_limit == parameters.effort_limit
-        ours = make_pendulum(
+        ours = make_plant(
             parameters.with_values(static_friction=parameters.coulomb_friction, load_friction=0.0), plant.dt
         )
         assert run(plant, 1.0, 2.0) == pytest.approx(run(ours, 1.0, 2.0), abs=0.05)
@@ -117,13 +117,13 @@ def test_an_exported_delay_is_read_back_and_acts(tmp_path: Path, delay: float) -
     path.write_text(mjcf(parameters), encoding="utf-8")
     plant = load_mujoco_plant(path)
     assert plant.parameters.transport_delay == delay
-    moves = [plant.step(1.0).theta_dot != 0.0 for _ in range(10)]
+    moves = [plant.step((1.0,), (0.0,)).velocity != (0.0,) for _ in range(10)]
     assert moves.index(True) in {5, 6}
 
 
 def test_an_actuator_with_several_controls_before_the_motor_shifts_no_index(tmp_path: Path) -> None:
     pid = '<pid name="servo" joint="{joint}" kp="0"/>'
-    plant = load_mujoco_plant(write(tmp_path, actuator=pid + MOTOR), MujocoMapping(actuator="torque"))
+    plant = load_mujoco_plant(write(tmp_path, actuator=pid + MOTOR), MujocoMapping(JointMapping(actuator="torque")))
     assert plant.parameters.effort_limit == 8.0
     alone = load_mujoco_plant(write(tmp_path))
     assert run(plant, 2.0, 3.0) == run(alone, 2.0, 3.0)
@@ -147,8 +147,8 @@ def test_a_hinge_with_a_spring_hangs_where_it_comes_to_rest(tmp_path: Path, rest
     )
     plant = load_mujoco_plant(path)
     assert f"it hangs at {rest:.6g}"[:18] in plant.remarks[0]
-    assert abs(plant.reset(0.0).theta) < 1e-9
-    assert max(abs(plant.step(0.0).theta) for _ in range(500)) < 1e-4
+    assert abs(plant.reset((0.0,), (0.0,)).position[0]) < 1e-9
+    assert max(abs(plant.step((0.0,), (0.0,)).position[0]) for _ in range(500)) < 1e-4
 
 
 def test_gravity_compensation_is_no_weight(tmp_path: Path) -> None:
@@ -213,9 +213,9 @@ def test_a_simulation_that_blows_up_says_so_and_does_not_start_anew(tmp_path: Pa
         timestep=0.02,
         actuator=MOTOR.replace("4 4", "1e300 1e300").replace("-4", "-1e300"),
     )
-    plant = load_mujoco_plant(path, MujocoMapping(effort_limit=1e200))
+    plant = load_mujoco_plant(path, MujocoMapping(JointMapping(effort_limit=1e200)))
     with pytest.raises(FaultError, match="is a timestep of 20 ms too long"):
-        [plant.step(1e200) for _ in range(5)]
+        [plant.step((1e200,), (0.0,)) for _ in range(5)]
     assert [found.name for found in tmp_path.iterdir()] == ["lab.xml"]
 
 
@@ -232,7 +232,7 @@ ARM = '<body name="arm"><joint name="elbow" type="hinge"/><geom type="sphere" si
             {},
             "actuator 'servo' of .* is no source of torque .*; expected a motor, or actuator: none",
         ),
-        ({"actuator": FREE}, {}, "has no limit of torque at its joint; expected effort_limit"),
+        ({"actuator": FREE}, {}, "has no limit of torque at its joint 'hinge'; expected effort_limit"),
         (
             {"actuator": MOTOR.replace("-4 4", "0 5")},
             {},
@@ -251,7 +251,7 @@ def test_what_cannot_be_driven_is_refused_in_one_sentence(
 ) -> None:
     path = write(tmp_path, **file)  # type: ignore[arg-type]
     with pytest.raises(ParameterError, match=sentence) as refused:
-        load_mujoco_plant(path, MujocoMapping(**mapping))  # type: ignore[arg-type]
+        load_mujoco_plant(path, MujocoMapping(JointMapping(**mapping)))  # type: ignore[arg-type]
     assert "\n" not in str(refused.value)
 
 
@@ -263,7 +263,7 @@ def test_a_rate_that_no_whole_timesteps_make_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("joint: hinge", "format is None; expected 'pendulum_simulation/1'"),
+        ("joint: hinge", "format is missing or another; expected 'pendulum_simulation/1'"),
         ("format: pendulum_simulation/1\njoints: hinge", "unknown parameter 'joints'; did you mean 'joint'"),
         ("format: pendulum_simulation/1\nzero: {value: 180, unit: deg}", "zero: unit is 'deg'; expected 'rad'"),
         ("format: pendulum_simulation/1\nsign: 2", "sign is 2; expected 1 or -1"),
@@ -285,7 +285,7 @@ def test_a_mapping_file_says_what_it_says(tmp_path: Path) -> None:
         "effort_limit: {value: 5, unit: N m}\ntimestep: {value: 0.002, unit: s}\n",
         encoding="utf-8",
     )
-    expected = MujocoMapping("hinge", "none", -1, 3.1, 5.0, 0.002)
+    expected = MujocoMapping(JointMapping("hinge", "none", -1, 3.1, 5.0), 0.002)
     assert load_mujoco_mapping(path) == expected
     assert load_mujoco_plant(write(tmp_path), expected).parameters.angle_offset == pytest.approx(3.1 - math.pi)
 

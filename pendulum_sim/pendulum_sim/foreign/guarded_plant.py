@@ -9,8 +9,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import FaultError, ParameterError, PendulumError
-from pendulum_sim.stepping.plant import Plant, PlantState
+from pendulum_sim.stepping.mechanism_plant import MechanismState
+from pendulum_sim.stepping.plants import JointPlant
 
 __all__ = ["GuardedPlant", "PaceWatch", "StallWatch", "in_one_sentence"]
 
@@ -25,33 +27,35 @@ _MEMORY = 0.02
 class GuardedPlant:
     """A plant whose exceptions and non-finite states become a FaultError."""
 
-    def __init__(self, plant: Plant, name: str) -> None:
+    def __init__(self, plant: JointPlant, name: str) -> None:
         self._plant = plant
         self._name = name
         self.parameters = plant.parameters
         self.dt = plant.dt
 
     @property
-    def state(self) -> PlantState:
+    def state(self) -> MechanismState:
         """The present state."""
         return self._plant.state
 
-    def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
+    def reset(self, position: Vector, velocity: Vector) -> MechanismState:
         """Restart; raise a FaultError if that fails."""
-        return self._try("reset", self._plant.reset, theta, theta_dot)
+        return self._try("reset", self._plant.reset, position, velocity)
 
-    def step(self, effort: float, push: float = 0.0) -> PlantState:
+    def step(self, effort: Vector, push: Vector) -> MechanismState:
         """Advance by one period; raise a FaultError if that fails."""
         return self._try("step", self._plant.step, effort, push)
 
-    def _try(self, what: str, function: Callable[..., PlantState], *arguments: float) -> PlantState:
+    def _try(self, what: str, function: Callable[..., MechanismState], *arguments: Vector) -> MechanismState:
         with in_one_sentence(f"simulation {self._name}", what, FaultError):
             state = function(*arguments)
-        if not (math.isfinite(state.theta) and math.isfinite(state.theta_dot) and math.isfinite(state.effort)):
-            raise FaultError(
-                f"simulation {self._name} is at {state.theta} rad, {state.theta_dot} rad/s, {state.effort} N m "
-                f"after {state.time:.3f} s; expected finite numbers"
-            )
+        for joint, q, v, u in zip(self.parameters.mechanism.joints, *state[1:], strict=True):
+            if not (math.isfinite(q) and math.isfinite(v) and math.isfinite(u)):
+                at = f"{q} {joint.unit}, {v} {joint.velocity_unit}, {u} {joint.effort_unit}"
+                whose = "" if len(state.position) == 1 else f" ({joint.name})"
+                raise FaultError(
+                    f"simulation {self._name} is at {at}{whose} after {state.time:.3f} s; expected finite numbers"
+                )
         return state
 
 

@@ -1,6 +1,7 @@
 """The mapping file of a MuJoCo model: what the model does not define in the contract's terms.
 
-All entries but the format are optional::
+All entries but the format are optional; with several joints all but format and timestep are in ``joints``, by name,
+and those of a sliding joint in m and N::
 
     format: pendulum_simulation/1
     joint: hinge                            # the only hinge, or pendulum_joint, by default
@@ -10,42 +11,40 @@ All entries but the format are optional::
     effort_limit: {value: 13.0, unit: N m}  # for a joint without an actuator
     timestep: {value: 0.002, unit: s}       # in place of the file's own
     control_per_torque: {value: 1.0, unit: 1/(N m)}  # control for 1 N m of command; by default 1 N m at the joint
+    joints:
+      elbow: {joint: hinge_2, sign: -1}
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.parameters import ParameterSpec, load_yaml, reject_unknown
+from pendulum_msgs_py.parameters import ParameterSpec, load_yaml, reject_unknown, require_mapping
 from pendulum_msgs_py.plants.quantities import read_quantities
 
-__all__ = ["FORMAT", "NO_ACTUATOR", "MujocoMapping", "load_mujoco_mapping"]
+__all__ = ["FORMAT", "NO_ACTUATOR", "JointMapping", "MujocoMapping", "load_mujoco_mapping"]
 
 FORMAT = "pendulum_simulation/1"
 NO_ACTUATOR = "none"
-_QUANTITIES = (
-    ParameterSpec("zero", 0.0, "rad", "The file's angle that is 0 in ours."),
-    ParameterSpec("effort_limit", 1.0, "N m", "Largest torque.", minimum=0.0, exclusive_minimum=True),
-    ParameterSpec("timestep", 0.002, "s", "Timestep.", minimum=0.0, exclusive_minimum=True),
-    ParameterSpec("control_per_torque", 1.0, "1/(N m)", "Control for a command of 1 N m."),
-)
 _TEXTS = ("joint", "actuator")
+_TIMESTEP = ParameterSpec("timestep", 0.002, "s", "Timestep.", minimum=0.0, exclusive_minimum=True)
 
 
 @dataclass(frozen=True)
-class MujocoMapping:
-    """Content of a mapping file; None and empty text mean an automatic choice.
+class JointMapping:
+    """Entries of one joint; None and empty text mean an automatic choice.
 
     Attributes:
-        joint: Name of the hinge.
-        actuator: Name of the actuator; ``none`` for torque on the joint itself.
-        sign: Sign of the file's angle in the contract's, 1 or -1.
-        zero: The file's angle that is 0 in the contract [rad].
-        effort_limit: Largest torque [N m].
-        timestep: In place of the file's own [s].
-        control_per_torque: Control for a command of 1 N m [1/(N m)].
+        joint: Name of the hinge or slide.
+        actuator: Name of the actuator; ``none`` for an effort on the joint itself.
+        sign: Sign of the file's position in the contract's, 1 or -1.
+        zero: The file's position that is 0 in the contract [rad or m].
+        effort_limit: Largest effort [N m or N].
+        control_per_torque: Control for a command of 1 [1/(N m) or 1/N].
     """
 
     joint: str = ""
@@ -53,25 +52,59 @@ class MujocoMapping:
     sign: int = 1
     zero: float | None = None
     effort_limit: float | None = None
-    timestep: float | None = None
     control_per_torque: float | None = None
 
 
-def load_mujoco_mapping(path: str | Path) -> MujocoMapping:
-    """Return the mapping in a file; a ParameterError names file and entry."""
+@dataclass(frozen=True)
+class MujocoMapping:
+    """Content of a mapping file.
+
+    Attributes:
+        one: Entries of the one joint.
+        joints: Entries of several, by name.
+        timestep: In place of the file's own [s].
+    """
+
+    one: JointMapping = JointMapping()
+    timestep: float | None = None
+    joints: Mapping[str, JointMapping] = field(default_factory=dict)
+
+
+def load_mujoco_mapping(path: str | Path, joints: Sequence[Joint] = ()) -> MujocoMapping:
+    """Return the mapping in a file, for a model of several ``joints`` or one; a ParameterError names file and entry."""
     document = load_yaml(path, "mapping file")
-    names = [spec.name for spec in _QUANTITIES]
-    reject_unknown(document, ("format", *_TEXTS, "sign", *names), where=str(path))
-    if document.get("format") != FORMAT:
-        raise ParameterError(f"{path}: format is {document.get('format')!r}; expected {FORMAT!r}")
+    if document.pop("format", None) != FORMAT:
+        raise ParameterError(f"{path}: format is missing or another; expected {FORMAT!r}")
+    where, timestep = str(path), {name: document.pop(name) for name in ("timestep",) if name in document}
+    step = read_quantities(timestep, (_TIMESTEP,), where)[0].get("timestep")
+    if not joints:
+        return MujocoMapping(_entries(document, ONE_JOINT.joints[0], where), step)
+    reject_unknown(document, ("joints",), where=where)
+    entries = require_mapping(document.get("joints", {}), f"{where}: joints")
+    reject_unknown(entries, [joint.name for joint in joints], where=f"{where}: joints")
+    found = {
+        joint.name: _entries(entries[joint.name], joint, f"{where}: {joint.name}")
+        for joint in joints
+        if joint.name in entries
+    }
+    return MujocoMapping(joints=found, timestep=step)
+
+
+def _entries(given: object, joint: Joint, where: str) -> JointMapping:
+    unit = joint.effort_unit
+    specs = (
+        ParameterSpec("zero", 0.0, joint.unit, "The file's position that is 0 in ours."),
+        ParameterSpec("effort_limit", 1.0, unit, "Largest effort.", minimum=0.0, exclusive_minimum=True),
+        ParameterSpec("control_per_torque", 1.0, f"1/({unit})" if " " in unit else f"1/{unit}", "Control for 1 of it."),
+    )
+    document, names = require_mapping(given, where), [spec.name for spec in specs]
+    reject_unknown(document, (*_TEXTS, "sign", *names), where=where)
     for name in _TEXTS:
         if not isinstance(document.get(name, ""), str):
-            raise ParameterError(f"{path}: {name} is {document[name]!r}; expected a name")
+            raise ParameterError(f"{where}: {name} is {document[name]!r}; expected a name")
     sign = document.get("sign", 1)
     if sign not in {1, -1} or isinstance(sign, bool):
-        raise ParameterError(f"{path}: sign is {sign!r}; expected 1 or -1")
-    quantities, _ = read_quantities(
-        {name: document[name] for name in names if name in document}, _QUANTITIES, str(path)
-    )
+        raise ParameterError(f"{where}: sign is {sign!r}; expected 1 or -1")
+    quantities, _ = read_quantities({name: document[name] for name in names if name in document}, specs, where)
     texts = {name: document[name] for name in _TEXTS if name in document}
-    return MujocoMapping(sign=sign, **texts, **quantities)  # type: ignore[arg-type]  # by name
+    return JointMapping(sign=sign, **texts, **quantities)  # type: ignore[arg-type]  # by name

@@ -1,57 +1,66 @@
-"""A model of MuJoCo as a plant: any MJCF or URDF with one hinge to drive.
+"""A model of MuJoCo as a plant: any MJCF or URDF with a hinge to drive, or with the joints of a plant file.
 
 Actuators, friction, integrator and timestep are the file's; a mapping file adds what is missing. A file of
-``export_model`` needs none: a joint with the contract's name has its zero and sign, and an actuator ``effort`` on it
-takes the contract's command.
+``export_model`` needs none: joints with the contract's names have its zero and sign, and actuators of its names on them
+take its commands.
 """
 
 from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pendulum_msgs_py.contract.angles import wrap
-from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Vector
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant
 from pendulum_msgs_py.programs.extras import how_to_install
-from pendulum_sim.foreign.mujoco_mapping import NO_ACTUATOR, MujocoMapping
+from pendulum_sim.foreign.mujoco_joint import ROUNDING, MujocoJoint
+from pendulum_sim.foreign.mujoco_mapping import JointMapping, MujocoMapping
 from pendulum_sim.foreign.mujoco_model import read_model
 from pendulum_sim.foreign.mujoco_switches import CAUSES, switch_off
-from pendulum_sim.stepping.plant import PlantState, check_start, command_within
+from pendulum_sim.stepping.mechanism_plant import MechanismState
+from pendulum_sim.stepping.plant import check_start, command_within
 
 __all__ = ["MujocoPlant", "load_mujoco_plant"]
 
-CONTRACT_ACTUATOR = "effort"
 PERIOD = 0.002
 """Default time between two states, unless the timestep is longer [s]."""
-_ANGLES = 24
-_ROUNDING = 1e-12
-_REST_ANGLES = 721
-_BISECTIONS = 60
+_UNITS = {"HINGE": "rad", "SLIDE": "m"}
+_SWEEPS = 100
+"""Largest number of times that each joint is brought to where it hangs beneath the others."""
 
 
 def load_mujoco_plant(
-    path: str | Path, mapping: MujocoMapping | None = None, *, rate_hz: float = 0.0, effort_limit: float = 0.0
+    path: str | Path,
+    mapping: MujocoMapping | None = None,
+    *,
+    rate_hz: float = 0.0,
+    effort_limit: float = 0.0,
+    equation: PlantParameters | None = None,
 ) -> MujocoPlant:
     """Return the plant of an MJCF or URDF file.
 
     ``rate_hz`` 0 is 500 Hz, or that of a longer timestep; ``effort_limit`` is the largest torque if neither file nor
-    mapping has one, 0 for none [N m].
+    mapping has one, 0 for none [N m]. ``equation`` is the plant of a model of several joints: their names and units,
+    which are driven, and limits that the file lacks; None for a pendulum, whose equation is read off the file.
 
     Raises:
-        ParameterError: MuJoCo is missing or refuses the file, or the file has no hinge that can be driven.
+        ParameterError: MuJoCo is missing or refuses the file, or the file has no such joints that can be driven.
     """
     mujoco = _import_mujoco()
     path = Path(path).expanduser()
     if not path.is_file():
         raise ParameterError(f"model {path} does not exist; expected an MJCF or URDF file")
     model, remarks = read_model(mujoco, path)
-    plant = MujocoPlant(mujoco, model, mapping or MujocoMapping(), str(path), rate_hz, effort_limit)
+    plant = MujocoPlant(mujoco, model, mapping or MujocoMapping(), str(path), rate_hz, effort_limit, equation)
     plant.remarks += remarks
     return plant
 
@@ -68,14 +77,21 @@ def _import_mujoco() -> Any:
 
 
 class MujocoPlant:
-    """A hinge of a MuJoCo model as a plant; see :func:`load_mujoco_plant`.
+    """Joints of a MuJoCo model as a plant; see :func:`load_mujoco_plant`.
 
-    ``parameters`` are the closest equation of a pendulum, in commanded torque; ``remarks`` the automatic choices as
-    text.
+    ``parameters`` are the given equation with the limits of the file, or the closest one of a pendulum, in commanded
+    torque; ``remarks`` the automatic choices as text.
     """
 
     def __init__(
-        self, mujoco: Any, model: Any, mapping: MujocoMapping, path: str, rate_hz: float, effort_limit: float
+        self,
+        mujoco: Any,
+        model: Any,
+        mapping: MujocoMapping,
+        path: str,
+        rate_hz: float,
+        effort_limit: float,
+        equation: PlantParameters | None = None,
     ) -> None:
         self._mujoco, self._model, self._path = mujoco, model, path
         self._data = mujoco.MjData(model)
@@ -84,44 +100,42 @@ class MujocoPlant:
         if mapping.timestep is not None:
             model.opt.timestep = mapping.timestep
         self.dt, self._substeps = self._choose_period(float(model.opt.timestep), rate_hz)
-        joint = self._choose_joint(mapping.joint)
-        self._qpos, self._dof = int(model.jnt_qposadr[joint]), int(model.jnt_dofadr[joint])
-        name = self._name("joint", joint)
-        self._actuator = self._choose_actuator(mapping.actuator, joint)
-        if self._actuator is not None:
-            # An actuator may have several controls.
-            self._control = int(model.actuator_ctrladr[self._actuator])
-            self._gear = float(model.actuator_gear[model.actuator_outadr[self._actuator], 0])
-        self._driven = self._dof if self._actuator is None else self._driven_dof(self._actuator)
-        self._driven_qpos = self._qpos if self._driven == self._dof else self._qpos_of(self._driven)
-        self._sign = mapping.sign
-        per_control = 1.0 if self._actuator is None else self._torque_per_control(self._actuator)
-        of_contract = (
-            name == JOINT and self._actuator is not None and self._name("actuator", self._actuator) == CONTRACT_ACTUATOR
-        )
-        self._control_per_torque = mapping.control_per_torque or (1.0 if of_contract else 1.0 / per_control)
-        gain = per_control * self._control_per_torque
-        weight, hanging = self._weight()
-        # Removes the fit's rounding, and -pi.
-        hanging = 0.0 if abs(hanging) < _ROUNDING else hanging
-        hanging = math.pi if abs(abs(hanging) - math.pi) < _ROUNDING else hanging
-        if mapping.zero is not None:
-            self._zero = mapping.zero
+        coordinates = ONE_JOINT if equation is None else equation.coordinates
+        limits = (effort_limit,) if equation is None else equation.effort_limits
+        of_driven = dict(zip(coordinates.driven, limits, strict=True))
+        chosen = self._chosen(mapping) if equation is None else self._matched(mapping, equation)
+        self._joints = tuple(
+            MujocoJoint(
+                mujoco, model, self._data, path, joint, chosen[joint.name], driven=i in of_driven,
+                effort_limit=of_driven.get(i, 0.0),
+            )
+            for i, joint in enumerate(coordinates.joints)
+        )  # fmt: skip
+        self._driven = tuple(self._joints[i] for i in coordinates.driven)
+        hangs = self._hang()
+        for joint, (_, hanging) in zip(self._joints, hangs, strict=True):
+            zero = chosen[joint.joint.name].zero
+            rests = 0.0 if joint.is_own else joint.rest(partial(self._place, hangs, joint), hanging)
+            joint.zero = rests if zero is None else zero
+        if equation is None:
+            self.parameters = self._describe(hangs)
         else:
-            self._zero = 0.0 if name == JOINT else self._rest(hanging)
-        limit = self._limit(mapping.effort_limit, effort_limit, joint)
-        self.parameters = self._describe(weight, hanging, gain, limit)
-        driven = (
-            "the joint itself" if self._actuator is None else f"actuator {self._name('actuator', self._actuator)!r}"
-        )
-        turned = ", turned round" if self._sign < 0 else ""
-        angles = f"its {self._zero:.6g} rad are our 0{turned}; it hangs at {self._rest(hanging):.6g} rad"
-        self.remarks = [
-            f"joint {name!r} through {driven}, at most {limit:g} N m; {angles}",
-            f"timestep {model.opt.timestep * 1e3:g} ms, {self._substeps} in a period",
-        ]
+            found = {f"{each.joint.name}.effort_limit": each.limit for each in self._driven}
+            self.parameters = equation.with_values(found)
+        self.remarks = []
+        for joint, (_, hanging) in zip(self._joints, hangs, strict=True):
+            unit = joint.joint.unit
+            through = f" through {joint.motor}, at most {joint.limit:g} {joint.unit}" if joint in self._driven else ""
+            turned = ", turned round" if joint.sign < 0 else ""
+            rest = joint.rest(partial(self._place, hangs, joint), hanging)
+            self.remarks.append(
+                f"joint {joint.name!r}{through}; its {joint.zero:.6g} {unit} are our 0{turned}; "
+                f"it hangs at {rest:.6g} {unit}"
+            )
+        self.remarks.append(f"timestep {model.opt.timestep * 1e3:g} ms, {self._substeps} in a period")
         self._steps = 0
-        self.reset()
+        self._still = (0.0,) * len(self._joints)
+        self.reset(self._still, self._still)
 
     @property
     def description(self) -> str:
@@ -130,51 +144,41 @@ class MujocoPlant:
         return f"mujoco {self._mujoco.__version__}, {integrator}"
 
     @property
-    def state(self) -> PlantState:
+    def state(self) -> MechanismState:
         """The present state."""
-        data = self._data
-        theta = self._sign * (float(data.qpos[self._qpos]) - self._zero)
-        if self._driven != self._dof:
-            # Behind a motor's spring a sensor at the joint measures the spring.
-            effort = float(data.qfrc_spring[self._dof])
-        elif self._actuator is None:
-            effort = float(data.qfrc_applied[self._dof]) - self._sign * self._push
-        else:
-            effort = float(data.qfrc_actuator[self._dof])
-        return PlantState(self._steps * self.dt, theta, self._sign * float(data.qvel[self._dof]), self._sign * effort)
+        return MechanismState(
+            self._steps * self.dt,
+            tuple(joint.position for joint in self._joints),
+            tuple(joint.velocity for joint in self._joints),
+            tuple(joint.effort for joint in self._joints),
+        )
 
-    def reset(self, theta: float = 0.0, theta_dot: float = 0.0) -> PlantState:
-        """Restart as the file does, except for the joint's angle [rad] and velocity [rad/s]; a motor follows."""
-        check_start(theta, theta_dot)
-        model, data = self._model, self._data
-        self._mujoco.mj_resetData(model, data)
-        angle = self._zero + self._sign * theta
-        data.qpos[self._qpos] = angle
-        data.qvel[self._dof] = self._sign * theta_dot
-        if self._driven != self._dof:
-            data.qpos[self._driven_qpos] += angle - model.qpos0[self._qpos]
-            data.qvel[self._driven] = self._sign * theta_dot
+    def reset(self, position: Vector, velocity: Vector) -> MechanismState:
+        """Restart as the file does, except for positions [rad or m] and velocities of the joints; motors follow."""
+        for q, v in zip(position, velocity, strict=True):
+            check_start(q, v)
+        self._mujoco.mj_resetData(self._model, self._data)
+        for joint, q, v in zip(self._joints, position, velocity, strict=True):
+            joint.start(q, v)
         self._steps = 0
-        self._push = 0.0
-        self._mujoco.mj_forward(model, data)
+        self._mujoco.mj_forward(self._model, self._data)
         return self.state
 
-    def step(self, effort: float, push: float = 0.0) -> PlantState:
-        """Advance by one period under a commanded torque, clamped to the limit, and a torque on the link [N m].
+    def step(self, effort: Vector, push: Vector) -> MechanismState:
+        """Advance by one period under m commanded efforts, clamped to the limits, and n efforts on the joints.
 
         Raises:
             FaultError: MuJoCo met values that are not finite, or too large.
-            ParameterError: A torque is not finite (nothing moves then).
+            ParameterError: An effort is not finite (nothing moves then).
         """
-        data = self._data
-        command = command_within(self.parameters.effort_limit, effort, push)
-        self._push = push
-        applied = push
-        if self._actuator is None:
-            applied += command
-        else:
-            data.ctrl[self._control] = self._sign * command * self._control_per_torque
-        data.qfrc_applied[self._dof] = self._sign * applied
+        data, commands = self._data, dict.fromkeys(self._joints, 0.0)
+        pushed = dict(zip(self._joints, push, strict=True))
+        for joint, wanted in zip(self._driven, effort, strict=True):
+            commands[joint] = command_within(joint.limit, wanted, pushed[joint])
+        for joint in self._joints:
+            command_within(math.inf, 0.0, pushed[joint])
+        for joint, command in commands.items():
+            joint.drive(command, pushed[joint])
         self._mujoco.mj_step(self._model, data, self._substeps)
         self._steps += 1
         for warning in ("BADQPOS", "BADQVEL", "BADQACC", "BADCTRL"):
@@ -191,20 +195,74 @@ class MujocoPlant:
         return CAUSES
 
     def without(self, causes: tuple[str, ...]) -> MujocoPlant:
-        """Return a copy with the same joint, zero and limit, and some causes switched off."""
+        """Return a copy with the same joints, zeros and limits, and some causes switched off."""
         other = copy.copy(self)
         other._model = copy.copy(self._model)
-        dofs = {self._dof, self._driven}
+        dofs = {dof for joint in self._joints for dof in (joint.dof, joint.driven_dof)}
+        actuators = {joint.actuator for joint in self._driven if joint.actuator is not None}
         for cause in causes:
-            other._substeps *= switch_off(self._mujoco, other._model, cause, dofs, self._actuator)
+            other._substeps *= switch_off(self._mujoco, other._model, cause, dofs, actuators)
         other._data = self._mujoco.MjData(other._model)
-        other.reset()
+        other._joints = tuple(copy.copy(joint) for joint in self._joints)
+        other._driven = tuple(other._joints[self._joints.index(joint)] for joint in self._driven)
+        for joint in other._joints:
+            joint.use(other._model, other._data)
+        other.reset(self._still, self._still)
         return other
 
     # --- contents of the file -------------------------------------------------------------------------------
 
-    def _name(self, kind: str, index: int) -> str:
-        return str(getattr(self._model, kind)(index).name) or f"number {index}"
+    def _chosen(self, mapping: MujocoMapping) -> Mapping[str, JointMapping]:
+        """Return the entries for the one joint of a pendulum."""
+        if mapping.joints:
+            listed = ", ".join(mapping.joints)
+            raise ParameterError(
+                f"the mapping of {self._path} has joints ({listed}); expected a plant file of several joints with them"
+            )
+        return {ONE_JOINT.joints[0].name: mapping.one}
+
+    def _matched(self, mapping: MujocoMapping, equation: PlantParameters) -> Mapping[str, JointMapping]:
+        """Return the entries of each joint; without any, joints of the file count by name, or else in order."""
+        joints = equation.mechanism.joints
+        found = {joint.name: mapping.joints.get(joint.name, JointMapping()) for joint in joints}
+        kinds = {int(getattr(self._mujoco.mjtJoint, f"mjJNT_{kind}")): unit for kind, unit in _UNITS.items()}
+        there = [
+            (str(self._model.joint(i).name), kinds[int(self._model.jnt_type[i])])
+            for i in range(self._model.njnt)
+            if int(self._model.jnt_type[i]) in kinds
+        ]
+        if all(each.joint or name in dict(there) for name, each in found.items()):
+            return found
+        if [unit for _, unit in there] == [joint.unit for joint in joints] and all(name for name, _ in there):
+            for joint, (name, _) in zip(joints, there, strict=True):
+                found[joint.name] = replace(found[joint.name], joint=found[joint.name].joint or name)
+            return found
+        has = ", ".join(f"{name or 'one without a name'} [{unit}]" for name, unit in there) or "none"
+        raise ParameterError(
+            f"{self._path} has the joints {has}; expected those of {equation.name}, {equation.coordinates.with_units}, "
+            "by these names or in this order, or joints in a mapping file"
+        )
+
+    def _hang(self) -> list[tuple[float, float]]:
+        """Return weight and hanging position of each joint, in the file's terms, with all of them hanging."""
+        found = [(0.0, float(self._model.qpos0[joint.qpos])) for joint in self._joints]
+        for _ in range(_SWEEPS):
+            before = list(found)
+            for i, joint in enumerate(self._joints):
+                weight, hanging = joint.weight(partial(self._place, found, joint))
+                # Removes the fit's rounding, and -pi.
+                hanging = 0.0 if abs(hanging) < ROUNDING else hanging
+                found[i] = weight, math.pi if abs(abs(hanging) - math.pi) < ROUNDING else hanging
+            if len(found) == 1 or max(abs(a[1] - b[1]) for a, b in zip(found, before, strict=True)) < ROUNDING:
+                break
+        return found
+
+    def _place(self, hangs: list[tuple[float, float]], moved: MujocoJoint, position: float) -> None:
+        """Put one joint at rest at a position of the file's, and the others where they hang."""
+        self._mujoco.mj_resetData(self._model, self._data)
+        for joint, (_, hanging) in zip(self._joints, hangs, strict=True):
+            joint.put(position if joint is moved else hanging)
+        self._mujoco.mj_forward(self._model, self._data)
 
     def _choose_period(self, timestep: float, rate_hz: float) -> tuple[float, int]:
         if not rate_hz:
@@ -219,168 +277,13 @@ class MujocoPlant:
             )
         return 1.0 / rate_hz, round(steps)
 
-    def _choose_joint(self, wanted: str) -> int:
-        hinge = int(self._mujoco.mjtJoint.mjJNT_HINGE)
-        hinges = [i for i in range(self._model.njnt) if self._model.jnt_type[i] == hinge]
-        names = {self._name("joint", i): i for i in hinges}
-        listed = ", ".join(names) or "none"
-        if wanted:
-            if wanted not in names:
-                raise ParameterError(f"{self._path} has no hinge {wanted!r}; expected one of its hinges: {listed}")
-            return names[wanted]
-        if JOINT in names:
-            return names[JOINT]
-        if len(hinges) != 1:
-            raise ParameterError(
-                f"{self._path} has {len(hinges)} hinges ({listed}); expected one, or joint in a mapping file"
-            )
-        return hinges[0]
-
-    def _choose_actuator(self, wanted: str, joint: int) -> int | None:
-        model = self._model
-        if wanted == NO_ACTUATOR:
-            return None
-        names = {self._name("actuator", i): i for i in range(model.nactuator)}
-        if wanted:
-            if wanted not in names:
-                listed = ", ".join(names) or "none"
-                raise ParameterError(f"{self._path} has no actuator {wanted!r}; expected none or one of: {listed}")
-            return names[wanted]
-        joints = {int(self._mujoco.mjtTrn.mjTRN_JOINT), int(self._mujoco.mjtTrn.mjTRN_JOINTINPARENT)}
-        on_joint = [
-            i
-            for i in range(model.nactuator)
-            if model.actuator_trntype[i] in joints and model.actuator_trnid[i, 0] == joint
-        ]
-        if not on_joint and self._name("joint", joint) == JOINT and CONTRACT_ACTUATOR in names:
-            # This project's export of a motor behind a spring.
-            return names[CONTRACT_ACTUATOR]
-        if len(on_joint) == 1 or not names:
-            return on_joint[0] if on_joint else None
-        there = f"{len(on_joint)} actuators on" if on_joint else "no actuator on"
-        raise ParameterError(
-            f"{self._path} has {there} joint {self._name('joint', joint)!r}; expected actuator in a mapping file: "
-            f"none, or one of {', '.join(names)}"
-        )
-
-    def _driven_dof(self, actuator: int) -> int:
-        kinds = {int(self._mujoco.mjtTrn.mjTRN_JOINT), int(self._mujoco.mjtTrn.mjTRN_JOINTINPARENT)}
-        joint = int(self._model.actuator_trnid[actuator, 0])
-        hinge = int(self._mujoco.mjtJoint.mjJNT_HINGE)
-        if self._model.actuator_trntype[actuator] not in kinds or self._model.jnt_type[joint] != hinge:
-            raise ParameterError(
-                f"actuator {self._name('actuator', actuator)!r} of {self._path} drives no hinge; expected one that "
-                "does, or actuator: none in a mapping file"
-            )
-        return int(self._model.jnt_dofadr[joint])
-
-    def _qpos_of(self, dof: int) -> int:
-        return int(self._model.jnt_qposadr[self._model.dof_jntid[dof]])
-
-    def _torque_per_control(self, actuator: int) -> float:
-        model, mujoco = self._model, self._mujoco
-        torque = self._gear * float(model.actuator_gainprm[actuator, 0])
-        lags = (mujoco.mjtDyn.mjDYN_NONE, mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
-        makes_torque = (
-            model.actuator_gaintype[actuator] == int(mujoco.mjtGain.mjGAIN_FIXED)
-            and not np.any(model.actuator_biasprm[actuator])
-            and model.actuator_dyntype[actuator] in {int(lag) for lag in lags}
-            and torque != 0.0
-        )
-        if not makes_torque:
-            raise ParameterError(
-                f"actuator {self._name('actuator', actuator)!r} of {self._path} is no source of torque (a servo, a "
-                "muscle?); expected a motor, or actuator: none in a mapping file"
-            )
-        return torque
-
-    def _limit(self, of_mapping: float | None, of_user: float, joint: int) -> float:
-        model, actuator = self._model, self._actuator
-        limits = []
-        if actuator is not None:
-            per_command = abs(self._control_per_torque)
-            per_force = abs(self._torque_per_control(actuator) * self._control_per_torque / self._gear)
-            for limited, bounds, per in (
-                (model.actuator_ctrllimited[self._control], model.actuator_ctrlrange[self._control], per_command),
-                (model.actuator_actlimited[actuator], model.actuator_actrange[actuator], per_command),
-                (model.actuator_forcelimited[actuator], model.actuator_forcerange[actuator], per_force),
-            ):
-                if limited and not bounds[0] < 0.0 < bounds[1]:
-                    low, high = sorted(float(bound) / per for bound in bounds)
-                    raise ParameterError(
-                        f"actuator {self._name('actuator', actuator)!r} of {self._path} gives {low:g} to {high:g} N m; "
-                        "expected torque both ways, or actuator: none and effort_limit in a mapping file"
-                    )
-                if limited:
-                    limits.append(_smaller(bounds) / per)
-        if self._driven == self._dof and model.jnt_actfrclimited[joint] and (actuator is not None or not of_mapping):
-            limits.append(_smaller(model.jnt_actfrcrange[joint]))
-        known = min(limits, default=math.inf)
-        if of_mapping is not None and of_mapping > known:
-            raise ParameterError(
-                f"effort_limit is {of_mapping:g} N m, the actuator of {self._path} gives {known:g} N m; expected at "
-                "most that, or actuator: none for torque on the joint itself"
-            )
-        limit = min(known, of_mapping or of_user or known)
-        if not (math.isfinite(limit) and limit > 0.0):
-            raise ParameterError(
-                f"{self._path} has no limit of torque at its joint; expected effort_limit as a parameter or in a "
-                "mapping file"
-            )
-        return limit
-
-    def _put(self, angle: float) -> None:
-        """Put the joint, with a motor, at rest at an angle of the file's."""
-        model, data = self._model, self._data
-        self._mujoco.mj_resetData(model, data)
-        data.qpos[self._qpos] = angle
-        if self._driven != self._dof:
-            data.qpos[self._driven_qpos] += angle - model.qpos0[self._qpos]
-        self._mujoco.mj_forward(model, data)
-
-    def _weight(self) -> tuple[float, float]:
-        """Return G and q_0 of a weight G sin(q - q_0), in the file's angle and torque."""
-        data = self._data
-        angles = np.linspace(-math.pi, math.pi, _ANGLES, endpoint=False)
-        torques = np.empty(_ANGLES)
-        for i, angle in enumerate(angles):
-            self._put(angle)
-            torques[i] = data.qfrc_bias[self._dof] - data.qfrc_gravcomp[self._dof]
-        basis = np.stack([np.sin(angles), np.cos(angles)], axis=1)
-        (a, b), *_ = np.linalg.lstsq(basis, torques, rcond=None)
-        if float(np.max(np.abs(torques))) < 1e-9:
-            return 0.0, float(self._model.qpos0[self._qpos])
-        return float(math.hypot(a, b)), math.atan2(-b, a)
-
-    def _rest(self, hanging: float) -> float:
-        """Return where the joint rests: hanging, unless a spring pulls it elsewhere."""
-
-        def torque(angle: float) -> float:
-            self._put(angle)
-            return float(data.qfrc_spring[self._dof] - data.qfrc_bias[self._dof] + data.qfrc_gravcomp[self._dof])
-
-        data = self._data
-        self._put(hanging)
-        if not np.any(self._model.jnt_stiffness[[self._model.dof_jntid[self._dof]]]):
-            return hanging
-        angles = hanging + np.linspace(-math.pi, math.pi, _REST_ANGLES)
-        torques = [torque(float(angle)) for angle in angles]
-        falls = [i for i in range(len(angles) - 1) if torques[i] >= 0.0 > torques[i + 1]]
-        if not falls:
-            return hanging
-        nearest = min(falls, key=lambda i: abs(angles[i] - hanging))
-        low, high = float(angles[nearest]), float(angles[nearest + 1])
-        for _ in range(_BISECTIONS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if torque(middle) >= 0.0 else (low, middle)
-        rest = 0.5 * (low + high)
-        return 0.0 if abs(rest) < _ROUNDING else rest
-
-    def _describe(self, weight: float, hanging: float, gain: float, limit: float) -> PlantParameters:
+    def _describe(self, hangs: list[tuple[float, float]]) -> PlantParameters:
+        """Return the closest equation of a pendulum."""
         model, data, mujoco = self._model, self._data, self._mujoco
-        self._put(hanging)
+        ((weight, hanging),), (joint,) = hangs, self._joints
+        self._place(hangs, joint, hanging)
         # In slow motion a motor behind a spring moves with the link.
-        dofs = sorted({self._dof, self._driven})
+        dofs = sorted({joint.dof, joint.driven_dof})
         inertia = 0.0
         for dof in dofs:
             one, masses = np.zeros(model.nv), np.zeros(model.nv)
@@ -389,25 +292,21 @@ class MujocoPlant:
             inertia += float(masses[dof])
         damping = sum(float(model.dof_damping[i]) for i in dofs)
         lag = delay = 0.0
-        if self._actuator is not None:
-            if model.actuator_dyntype[self._actuator] != int(mujoco.mjtDyn.mjDYN_NONE):
-                lag = float(model.actuator_dynprm[self._actuator, 0])
-            delay = float(model.actuator_delay[self._actuator])
+        if joint.actuator is not None:
+            if model.actuator_dyntype[joint.actuator] != int(mujoco.mjtDyn.mjDYN_NONE):
+                lag = float(model.actuator_dynprm[joint.actuator, 0])
+            delay = float(model.actuator_delay[joint.actuator])
             # MuJoCo stores the motor's separately.
-            damping += float(model.actuator_damping[self._actuator]) * self._gear**2
-        gain = abs(gain)
+            damping += float(model.actuator_damping[joint.actuator]) * joint.gear**2
+        gain = abs(joint.gain)
         return pendulum_plant(
             inertia=inertia / gain,
             damping=damping / gain,
             gravity=weight / gain,
             coulomb_friction=sum(float(model.dof_frictionloss[i]) for i in dofs) / gain,
-            angle_offset=wrap(self._sign * (hanging - self._zero)),
-            effort_limit=limit,
+            angle_offset=wrap(joint.sign * (hanging - joint.zero)),
+            effort_limit=joint.limit,
             actuator_time_constant=lag,
             transport_delay=delay,
             name=Path(self._path).stem,
         )
-
-
-def _smaller(bounds: Any) -> float:
-    return float(min(abs(bounds[0]), abs(bounds[1])))

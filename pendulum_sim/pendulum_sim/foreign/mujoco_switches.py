@@ -34,10 +34,10 @@ CAUSES = (*_DISABLED, *_CLEARED, _DRIVE, _FLUID, _JOINTS, _ACTUATORS, _FLAG, _TI
 """Names of these parts."""
 
 
-def switch_off(mujoco: Any, model: Any, cause: str, dofs: Collection[int], actuator: int | None) -> int:
+def switch_off(mujoco: Any, model: Any, cause: str, dofs: Collection[int], own: Collection[int]) -> int:
     """Switch one of ``CAUSES`` off in a model, in place; return how many steps replace one.
 
-    ``dofs`` are the degrees of freedom of the joint and its motor; ``actuator`` is its actuator's index, or None.
+    ``dofs`` are the degrees of freedom of the joints and their motors; ``own`` are the indices of their actuators.
     """
     if cause in _DISABLED:
         model.opt.disableflags |= int(getattr(mujoco.mjtDisableBit, _DISABLED[cause]))
@@ -53,7 +53,7 @@ def switch_off(mujoco: Any, model: Any, cause: str, dofs: Collection[int], actua
         others = [i for i in range(model.nv) if i not in dofs]
         model.dof_armature[others] += _LOCKED * max(1.0, float(np.max(model.dof_M0)))
     elif cause == _ACTUATORS:
-        others = [i for i in range(model.nactuator) if i != actuator]
+        others = [i for i in range(model.nactuator) if i not in own]
         for field in ("gainprm", "biasprm", "damping", "dampingpoly"):
             getattr(model, f"actuator_{field}")[others] = 0.0
     elif cause == _FLAG:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,15 +11,21 @@ from typing import Any, NamedTuple
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PLANT_SPECS, PRESET_NAMES
+from pendulum_msgs_py.plants.plant_parameters import (
+    MECHANISM_PRESETS,
+    PLANT_SPECS,
+    PRESET_NAMES,
+    PlantParameters,
+    is_mechanism,
+    load_mechanism,
+)
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_sim.foreign.equation_check import EquationCheck, Switches, check_equation
 from pendulum_sim.foreign.guarded_plant import GuardedPlant, in_one_sentence
-from pendulum_sim.foreign.gymnasium_plant import GymnasiumPlant, load_adapter, load_gymnasium_plant
+from pendulum_sim.foreign.gymnasium_plant import load_adapter, load_gymnasium_plant
 from pendulum_sim.foreign.mujoco_mapping import MujocoMapping, load_mujoco_mapping
-from pendulum_sim.foreign.mujoco_plant import MujocoPlant, load_mujoco_plant
+from pendulum_sim.foreign.mujoco_plant import load_mujoco_plant
 from pendulum_sim.stepping.integrators import METHODS
-from pendulum_sim.stepping.plant import Plant
 from pendulum_sim.stepping.plants import JointPlant, OneJoint, make_plant
 
 __all__ = ["GYMNASIUM", "GYMNASIUM_PREFIX", "MUJOCO", "OWN", "Engine", "Simulation", "find_engine", "open_simulation"]
@@ -43,13 +49,6 @@ class Simulation(NamedTuple):
     remarks: tuple[str, ...] = ()
     sealed: bool = False
     check: Callable[[], EquationCheck] | None = None
-
-    @property
-    def pendulum(self) -> Plant:
-        """The plant of one joint; a ParameterError for several."""
-        if not isinstance(self.plant, OneJoint):
-            raise ParameterError(f"simulation {self.name} has several joints; expected one")
-        return self.plant.plant
 
 
 @dataclass(frozen=True)
@@ -109,10 +108,28 @@ def _make_mujoco(values: Mapping[str, Any]) -> Simulation:
     model, mapping = values["model"], values["mapping"]
     if not model:
         raise ParameterError("model is missing; expected -p model:=FILE, an MJCF or URDF file")
-    choices = load_mujoco_mapping(mapping) if mapping else MujocoMapping()
+    equation = _equation(values)
+    choices = MujocoMapping()
+    if mapping:
+        choices = load_mujoco_mapping(mapping, () if equation is None else equation.mechanism.joints)
     with in_one_sentence(f"model {model}", "loading", ParameterError):
-        plant = load_mujoco_plant(model, choices, rate_hz=values["rate_hz"], effort_limit=values["effort_limit"])
-    return _foreign(plant, model, Path(model).name)
+        plant = load_mujoco_plant(
+            model, choices, rate_hz=values["rate_hz"], effort_limit=values["effort_limit"], equation=equation
+        )
+    label = Path(model).name
+    again = Switches(plant.switches, lambda causes: GuardedPlant(plant.without(causes), label))
+    return _foreign(plant, model, label, plant.description, plant.remarks, switches=again)
+
+
+def _equation(values: Mapping[str, Any]) -> PlantParameters | None:
+    """Return the plant of a simulation of several joints, None for a pendulum."""
+    if not values["plant"]:
+        return None
+    if not is_mechanism(values["plant"]):
+        raise ParameterError(
+            f"plant is {values['plant']}, of one joint, whose equation is found; expected one of several, or none"
+        )
+    return load_mechanism(values["plant"])
 
 
 def _make_gymnasium(values: Mapping[str, Any]) -> Simulation:
@@ -122,31 +139,30 @@ def _make_gymnasium(values: Mapping[str, Any]) -> Simulation:
     adapter = load_adapter(mapping) if mapping else None
     with in_one_sentence(f"environment {env}", "loading", ParameterError):
         plant = load_gymnasium_plant(env, adapter, seed=values["seed"], effort_limit=values["effort_limit"])
-    return _foreign(plant, env, env)
+    again = GuardedPlant(OneJoint(plant.reseeded()), env)
+    return _foreign(OneJoint(plant), env, env, plant.description, plant.remarks, reseeded=again)
 
 
-def _foreign(plant: MujocoPlant | GymnasiumPlant, name: str, label: str) -> Simulation:
-    guarded = GuardedPlant(plant, label)
+def _foreign(
+    plant: JointPlant, name: str, label: str, description: str, remarks: Sequence[str],
+    *, switches: Switches | None = None, reseeded: JointPlant | None = None,
+) -> Simulation:  # fmt: skip
+    guarded, parameters = GuardedPlant(plant, label), plant.parameters
 
     def check() -> EquationCheck:
-        substeps = math.ceil(plant.dt / _EXACT_STEP)
-        equation = make_plant(plant.parameters, plant.dt, substeps=substeps)
-        switches = reseeded = None
-        if isinstance(plant, MujocoPlant):
-            switches = Switches(plant.switches, lambda causes: OneJoint(GuardedPlant(plant.without(causes), label)))
-        else:
-            reseeded = OneJoint(GuardedPlant(plant.reseeded(), label))
+        equation = make_plant(parameters, plant.dt, substeps=math.ceil(plant.dt / _EXACT_STEP))
         try:
-            coarse = make_plant(plant.parameters, plant.dt, method="semi_implicit")
+            coarse = make_plant(parameters, plant.dt, method="semi_implicit")
         except ParameterError:
-            # It is unstable with that period.
+            # It is unstable with that period, or has several joints.
             coarse = None
-        return check_equation(OneJoint(guarded), equation, coarse=coarse, switches=switches, reseeded=reseeded)
+        return check_equation(guarded, equation, coarse=coarse, switches=switches, reseeded=reseeded)
 
-    found = [(spec, getattr(plant.parameters, spec.name)) for spec in PLANT_SPECS if spec.name in _OF_EQUATION]
-    values = ", ".join(f"{spec.name} {value:.6g} {spec.unit}" for spec, value in found)
-    remarks = (*plant.remarks, f"closest equation: {values}")
-    return Simulation(OneJoint(guarded), name, plant.description, remarks, check=check)
+    if parameters.is_pendulum:
+        found = [(spec, getattr(parameters, spec.name)) for spec in PLANT_SPECS if spec.name in _OF_EQUATION]
+        values = ", ".join(f"{spec.name} {value:.6g} {spec.unit}" for spec, value in found)
+        remarks = (*remarks, f"closest equation: {values}")
+    return Simulation(guarded, name, description, tuple(remarks), check=check)
 
 
 OWN = Engine(
@@ -179,11 +195,15 @@ OWN = Engine(
 
 MUJOCO = Engine(
     program="mujoco",
-    description="A hinge of a MuJoCo model (MJCF or URDF) behind the interface that simulator and hardware share.",
+    description="A MuJoCo model (MJCF or URDF) behind the interface that simulator and hardware share.",
     specs=(
         ParameterSpec("model", "", "", "MJCF or URDF file.", read_only=True),
         ParameterSpec(
             "mapping", "", "", "Mapping file: joint, actuator, sign, zero, limit; empty for none.", read_only=True
+        ),
+        ParameterSpec(
+            "plant", "", "", "Preset or plant file of a model of several joints; empty for a pendulum, whose equation "
+            "is read off the file.", read_only=True,
         ),
         replace(
             _RATE, default=0.0, minimum=0.0,
@@ -221,8 +241,11 @@ def find_engine(simulation: str) -> tuple[Engine, dict[str, str]]:
     return MUJOCO, {"model": str(Path(simulation).expanduser().resolve())}
 
 
-def open_simulation(simulation: str, mapping: str = "") -> Simulation:
-    """Return a third-party simulation in this process, with a mapping file or none; a ParameterError if refused."""
+def open_simulation(simulation: str, mapping: str = "", plant: str = "") -> Simulation:
+    """Return a third-party simulation in this process; a ParameterError if refused.
+
+    ``mapping`` is its mapping file, empty for none; ``plant`` preset or file of one of several joints, empty for one.
+    """
     engine, named = find_engine(simulation)
     defaults = {spec.name: spec.default for spec in engine.specs}
-    return engine.make({**defaults, "seed": 0, "effort_limit": 0.0, **named, "mapping": mapping})
+    return engine.make({**defaults, "seed": 0, "effort_limit": 0.0, **named, "mapping": mapping, "plant": plant})

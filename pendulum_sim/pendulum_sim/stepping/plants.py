@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 
@@ -42,7 +43,21 @@ class OneJoint:
         return MechanismState(time, (theta,), (theta_dot,), (torque,))
 
 
-JointPlant = MechanismPlant | OneJoint
+class JointPlant(Protocol):
+    """A plant of n joints of which m are driven."""
+
+    parameters: PlantParameters
+    dt: float
+
+    @property
+    def state(self) -> MechanismState:
+        """The present state."""
+
+    def reset(self, position: Vector, velocity: Vector) -> MechanismState:
+        """Restart at n positions [rad or m] and velocities."""
+
+    def step(self, effort: Vector, push: Vector) -> MechanismState:
+        """Advance by one period under m commanded efforts, and n efforts on the joints themselves [N m or N]."""
 
 
 def make_plant(

@@ -20,7 +20,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism, load_plant
-from pendulum_sim.stepping.plants import JointPlant, OneJoint, make_plant
+from pendulum_sim.stepping.plants import JointPlant, make_plant
 from pendulum_sim.stepping.sensors import Sensors
 
 __all__ = ["RunArrays", "simulate", "simulate_plant"]
@@ -57,7 +57,7 @@ def simulate(spec: RunSpec) -> RunArrays:
     if spec.has_bridge or spec.plant_parameters:
         raise ParameterError("a run in one process is of the plain simulator; others run as nodes")
     if (foreign := spec.foreign) is not None:
-        return _simulate(spec, OneJoint(foreign.open()), Sensors())
+        return _simulate(spec, foreign.open(), Sensors())
     if (mechanism := spec.mechanism) is not None:
         return _simulate(spec, make_plant(mechanism, _whole(spec.period)), Sensors())
     return simulate_plant(spec, load_plant(spec.plant))
@@ -75,7 +75,7 @@ def _whole(period: float) -> float:
 
 def _simulate(spec: RunSpec, plant: JointPlant, sensors: Sensors) -> RunArrays:
     period_ns = round(NANOSECONDS * spec.period)
-    coordinates, is_one = plant.parameters.coordinates, isinstance(plant, OneJoint)
+    coordinates, is_one = plant.parameters.coordinates, plant.parameters.is_pendulum
     limits: dict[str, Any] = validate(LIMIT_SPECS, BEGINS_ANYWHERE if is_one else {})
     supervisor = PlantSupervisor(
         limits_from_parameters(limits, plant.parameters.effort_limits, coordinates=coordinates, lockstep=True),

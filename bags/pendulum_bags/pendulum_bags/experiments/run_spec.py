@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from pendulum_bags.experiments.simulation import ForeignSimulation
+from pendulum_bags.experiments.simulation import ForeignSimulation, absolute_plant
 from pendulum_bags.runs.case import IDENTITY, plant_identity
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
@@ -159,7 +159,9 @@ class RunSpec:
     @property
     def foreign(self) -> ForeignSimulation | None:
         """The third-party simulation; None for the built-in one and the emulated hardware."""
-        return ForeignSimulation(self.simulation, self.mapping) if self.simulation else None
+        if not self.simulation:
+            return None
+        return ForeignSimulation(self.simulation, self.mapping, self.plant if is_mechanism(self.plant) else "")
 
     @property
     def identity(self) -> str:
@@ -212,11 +214,14 @@ class RunSpec:
             loop["initial_position"] = float(self.theta)
             return graph.bridge("/hw", backend="emulator", effort_strategy=self.strategy, **loop)
         if mechanism is not None:
-            loop.update(start="top", rate_hz=1.0 / self.period, armed_at_start=True, paused=True)
-            return graph.simulator("/sim", **loop)
-        loop = {**BEGINS_ANYWHERE, **loop, "initial_theta": float(self.theta), "armed_at_start": True, "paused": True}
+            loop.update(start="top", armed_at_start=True, paused=True)
+        else:
+            start = {"initial_theta": float(self.theta), "armed_at_start": True, "paused": True}
+            loop = {**BEGINS_ANYWHERE, **loop, **start}
         if foreign is not None:
             return foreign.program(self.namespace, **loop)
+        if mechanism is not None:
+            return graph.simulator("/sim", rate_hz=1.0 / self.period, **loop)
         return graph.simulator("/sim", method=self.method, rate_hz=1.0 / self.period, **loop)
 
     def controller_program(self) -> NodeProgram:
@@ -301,8 +306,3 @@ def integrator_of(plant: str, method: str) -> str:
         return "auto"
     elastic = load_plant_to_run(plant)[0].drivetrain is not None
     return "auto" if elastic and method == THESIS_METHOD else method
-
-
-def absolute_plant(plant: str) -> str:
-    """Return a preset unchanged, and a file's absolute path."""
-    return plant if Path(plant).suffix == "" else str(Path(plant).resolve())

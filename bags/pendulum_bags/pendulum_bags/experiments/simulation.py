@@ -19,10 +19,9 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_msgs_py.programs.graph import NodeProgram, ParameterArgument
 from pendulum_sim.foreign.equation_check import TOLERANCE, EquationCheck, check_recording
 from pendulum_sim.simulator.engines import find_engine, open_simulation
-from pendulum_sim.stepping.plant import Plant
-from pendulum_sim.stepping.plants import make_plant
+from pendulum_sim.stepping.plants import JointPlant, make_plant
 
-__all__ = ["ForeignSimulation", "recorded_difference"]
+__all__ = ["ForeignSimulation", "absolute_plant", "recorded_difference"]
 
 EQUATION_FILE = "simulation.yaml"
 _PIECES = 0.9
@@ -39,18 +38,29 @@ class _Facts:
 
 
 @cache
-def _facts(name: str, mapping: str) -> _Facts:
-    made = open_simulation(name, mapping)
+def _facts(name: str, mapping: str, plant: str) -> _Facts:
+    made = open_simulation(name, mapping, plant)
     assert made.check is not None  # of others
-    return _Facts(made.pendulum.parameters, made.plant.dt, made.method, made.remarks, made.check())
+    return _Facts(made.plant.parameters, made.plant.dt, made.method, made.remarks, made.check())
 
 
 @dataclass(frozen=True)
 class ForeignSimulation:
-    """A simulation in place of the simulator: a model file or ``gymnasium:ID``, and its mapping file or ""."""
+    """A simulation in place of the simulator.
+
+    Attributes:
+        name: Model file, or ``gymnasium:ID``.
+        mapping: Its mapping file; empty for none.
+        plant: Preset or plant file of a simulation of several joints; empty for a pendulum, whose equation is found.
+    """
 
     name: str
     mapping: str = ""
+    plant: str = ""
+
+    @property
+    def _facts(self) -> _Facts:
+        return _facts(self.name, self.mapping, self.plant)
 
     @property
     def label(self) -> str:
@@ -60,17 +70,17 @@ class ForeignSimulation:
     @property
     def parameters(self) -> PlantParameters:
         """The nearest equation; a ParameterError if the simulation is refused."""
-        return _facts(self.name, self.mapping).parameters
+        return self._facts.parameters
 
     @property
     def period(self) -> float:
         """Time between two states [s]."""
-        return _facts(self.name, self.mapping).period
+        return self._facts.period
 
     def check(self, hold_time: float) -> None:
         """Raise a ParameterError if it is too weak or slow to be held upright; noise is held ``hold_time`` [s]."""
         found = self.parameters
-        if found.gravity >= found.effort_limit:
+        if found.is_pendulum and found.gravity >= found.effort_limit:
             environment = find_engine(self.name)[0].program == "gymnasium"
             way = "set, on the attribute that limits it," if environment else "effort_limit with actuator: none"
             raise ParameterError(
@@ -85,10 +95,10 @@ class ForeignSimulation:
 
     def require_equation(self) -> None:
         """Raise a ParameterError if the simulation deviates from its equation: how much, where, and a tested cause."""
-        if not (check := _facts(self.name, self.mapping).check).agrees:
+        if not (check := self._facts.check).agrees:
             raise ParameterError(
-                f"simulation {self.name} {check}; expected one that does, --plant FILE to design on "
-                "another equation, or --accept-differences to design on this one all the same"
+                f"simulation {self.name} {check}; expected one that does, --plant FILE to design on another equation, "
+                "or --accept-differences to design on this one all the same"
             )
 
     def absolute(self) -> dict[str, str]:
@@ -96,19 +106,20 @@ class ForeignSimulation:
         given = {"simulation": self.name, "mapping": self.mapping}
         return {key: str(Path(text).resolve()) if Path(text).is_file() else text for key, text in given.items()}
 
-    def open(self) -> Plant:
+    def open(self) -> JointPlant:
         """Return the simulation in this process."""
-        return open_simulation(self.name, self.mapping).pendulum
+        return open_simulation(self.name, self.mapping, self.plant).plant
 
     def program(self, namespace: str, **parameters: ParameterArgument) -> NodeProgram:
         """Return its node, which has the simulator's name."""
         engine, named = find_engine(self.name)
-        mapping = {"mapping": str(Path(self.mapping).expanduser().resolve())} if self.mapping else {}
-        return NodeProgram("pendulum_sim", engine.program, namespace, "simulator", {**named, **mapping, **parameters})
+        given = {"mapping": str(Path(self.mapping).expanduser().resolve())} if self.mapping else {}
+        given |= {"plant": absolute_plant(self.plant)} if self.plant else {}
+        return NodeProgram("pendulum_sim", engine.program, namespace, "simulator", {**named, **given, **parameters})
 
     def write_equation(self, folder: Path) -> Path:
         """Write the closest equation as a plant file, for a controller to be designed on; return the file."""
-        facts = _facts(self.name, self.mapping)
+        facts = self._facts
         provenance = {
             "simulation": self.name,
             "engine": facts.method,
@@ -125,7 +136,7 @@ class ForeignSimulation:
 
     def to_json(self) -> dict[str, Any]:
         """Return its entry in a bag's metadata."""
-        facts = _facts(self.name, self.mapping)
+        facts = self._facts
         return {
             "name": self.label,
             "engine": facts.method,
@@ -134,6 +145,11 @@ class ForeignSimulation:
             "equation": describe_plants([facts.parameters]),
             **({} if facts.check.agrees else {DIFFERENCE: str(facts.check)}),
         }
+
+
+def absolute_plant(plant: str) -> str:
+    """Return a preset unchanged, and a file's absolute path."""
+    return plant if Path(plant).suffix == "" else str(Path(plant).resolve())
 
 
 def recorded_difference(bag: Path, namespace: str, plant: str) -> str:
