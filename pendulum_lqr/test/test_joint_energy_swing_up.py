@@ -69,7 +69,7 @@ def test_it_learns_to_aim_below_upright_where_the_model_has_more_friction_than_t
     plant = load_mechanism(name)
     controller = make_controller("energy_swing_up", plant, PERIOD)
     machines = pytest.importorskip("pendulum_bags.experiments.joint_run")
-    lighter = machines.stand_in_for(plant, share=0.05, delay=0.0, seed=seed)
+    lighter = machines.surrogate_for(plant, share=0.05, delay=0.0, seed=seed)
     start = tuple(float(value) for value in np.random.default_rng(seed - 1).uniform(-0.2, 0.2, 2))
     _, deviations, _ = _swing(controller, lighter, start, 15.0)
     assert np.abs(deviations[-50:]).max() < 0.2

@@ -101,7 +101,7 @@ def test_a_table_has_a_line_for_each_row() -> None:
 
 def test_a_stand_in_of_a_machine_is_late_and_a_little_off_and_its_equal_frictions_stay_equal() -> None:
     plant = load_plant("dfki").with_values(coulomb_friction=0.09, static_friction=0.09)
-    found = [bench_learn._stand_in(plant, seed) for seed in range(1, 201)]
+    found = [bench_learn._surrogate(plant, seed) for seed in range(1, 201)]
     for each in found:
         assert isinstance(each, PlantParameters)
         assert each.transport_delay == 0.004

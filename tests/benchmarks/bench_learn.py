@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_bags.experiments.joint_run import stand_in_for
+from pendulum_bags.experiments.joint_run import surrogate_for
 from pendulum_bags.studies.leaderboard import evaluate
 from pendulum_bags.studies.leaderboard_hardware import evaluate_hardware
 from pendulum_learning.evaluation import Trial, is_up, measured_success, run_trial, trials_of
@@ -47,7 +47,7 @@ _BARE = ("share", "delay", "jitter", "angle-noise", "velocity-noise", "kick")
 """What a training without randomisation leaves out."""
 _BARE_WORDS = [word for name in _BARE for word in (f"--{name}", "0")]
 _OFF, _LATE = 0.05, 0.004
-"""How far a stand-in for a machine is off, as a share, and its delay [s]: those of ``experiment joints``."""
+"""How far a surrogate of a machine is off, as a share, and its delay [s]: those of ``experiment joints``."""
 _NEAR = 0.05
 """Share of a random start that remains of it around hanging."""
 _FINISHED, _UNFINISHED = 60, ((12, 1), (6, 2))
@@ -181,13 +181,13 @@ def _cart_pole_trials(policy: Policy, trials: list[Trial]) -> dict[str, list[Tri
 def _stand_ins(plant: PlantParameters, randomised: Path, bare: Path) -> Iterator[Row]:
     """Yield what machines take off the score of a policy: second simulations, drawn as ``experiment joints`` does."""
     _train("--plant", plant.name, *_BARE_WORDS, out=bare)
-    machines = [_stand_in(plant, seed) for seed in range(1, 21)]
+    machines = [_surrogate(plant, seed) for seed in range(1, 21)]
     for name, out, limit in (("randomised", randomised, 5.0), ("not randomised", bare, None)):
         policy = load_policy(str(out))
         sim, *others = (_time_up(policy, each) for each in (plant, *machines))
         hw = float(np.mean(others))
         yield measured(
-            f"{plant.name}, policy {name}: score lost, simulator to {len(machines)} stand-ins of machines",
+            f"{plant.name}, policy {name}: score lost, simulator to {len(machines)} surrogates of machines",
             100.0 * (1.0 - hw / sim) if sim else float("nan"),
             "%",
             at_most=limit,
@@ -196,10 +196,10 @@ def _stand_ins(plant: PlantParameters, randomised: Path, bare: Path) -> Iterator
         )
 
 
-def _stand_in(plant: PlantParameters, seed: int) -> PlantParameters:
+def _surrogate(plant: PlantParameters, seed: int) -> PlantParameters:
     """Return a second simulation in the place of a machine."""
     if not plant.is_pendulum:
-        return stand_in_for(plant, share=_OFF, delay=_LATE, seed=seed)
+        return surrogate_for(plant, share=_OFF, delay=_LATE, seed=seed)
     drawn = np.random.default_rng(seed)
     values = {name: plant.value(name) * (1.0 + float(drawn.uniform(-_OFF, _OFF))) for name in VARIED}
     if plant.coulomb_friction:

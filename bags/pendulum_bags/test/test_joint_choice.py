@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pendulum_bags.experiments.in_process import simulate
-from pendulum_bags.experiments.joint_run import JointSettings, default_amplitude, stand_in_for
+from pendulum_bags.experiments.joint_run import JointSettings, default_amplitude, surrogate_for
 from pendulum_bags.experiments.repeats import record_simulation
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import NoiseSettings
@@ -43,7 +43,7 @@ def test_contenders_of_several_joints_differ_in_what_they_command(plant: str) ->
 
 
 def test_a_plant_near_the_simulated_one_picks_the_same_controller_and_one_that_fell_is_none(tmp_path: Path) -> None:
-    drawn = stand_in_for(load_mechanism("cart_pole"), share=0.02, delay=0.0, seed=1)
+    drawn = surrogate_for(load_mechanism("cart_pole"), share=0.02, delay=0.0, seed=1)
     machine = write_plant(tmp_path / "machine.yaml", drawn, provenance={})
     run = settings_of("cart_pole").run("sim")
     # Simulated, the machine's side is read as one that has run.

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pendulum_bags.experiments.joint_run import JointSettings, stand_in_for
+from pendulum_bags.experiments.joint_run import JointSettings, surrogate_for
 from pendulum_bags.experiments.settings import NoiseSettings
 from pendulum_bags.frequency_response.analyse import analyse_responses
 from pendulum_bags.frequency_response.designs import certify_designs
@@ -147,7 +147,7 @@ def test_delay_and_gain_are_those_of_the_driven_joint() -> None:
 @pytest.mark.parametrize("name", DRIVEN_ALONE)
 def test_between_and_below_the_lines_the_machine_is_what_it_is(name: str) -> None:
     plant, model = load_mechanism(name), _model(name)
-    other = replace(linearise(stand_in_for(plant, share=0.1, delay=0.0, seed=2)), delay=0.005)
+    other = replace(linearise(surrogate_for(plant, share=0.1, delay=0.0, seed=2)), delay=0.005)
     measured = _exact(other, plant, "hw")
     machine = Machine.relative_to(measured, model)
     true = model_response(other, machine.frequency, PERIOD)
@@ -203,7 +203,7 @@ def test_no_certified_gain_fails_on_the_machine_that_was_measured(name: str) -> 
     generator = np.random.default_rng(7)
     certified = sound = 0
     for seed in range(6):
-        machine = stand_in_for(plant, share=0.1, delay=0.0, seed=seed)
+        machine = surrogate_for(plant, share=0.1, delay=0.0, seed=seed)
         other = replace(linearise(machine), delay=float(generator.uniform(0.0, 0.01)))
         measured = _exact(other, plant, "hw", 0.05)
         certifier = Certifier(model, Machine.relative_to(measured, model), _scaling(plant, model))

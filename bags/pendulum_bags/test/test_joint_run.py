@@ -16,14 +16,14 @@ from pendulum_bags.experiments.joint_run import (
     design_file,
     design_for,
     fall_time,
-    load_stand_in,
+    load_surrogate,
     require_upright,
-    stand_in_for,
+    surrogate_for,
 )
 from pendulum_bags.experiments.repeats import record_simulation
 from pendulum_bags.experiments.settings import NoiseSettings
 from pendulum_bags.frequency_response.multisine import Multisine
-from pendulum_bags.runs.run_record import RUN_RECORD, stands_in
+from pendulum_bags.runs.run_record import RUN_RECORD, is_surrogate
 from pendulum_bags.whole import carry_out
 from pendulum_bags.whole.carry_out import Order
 from pendulum_lqr.linear.design import output_lqr
@@ -41,15 +41,15 @@ GIVEN = ("gravity", "gear_ratio", "elbow.effort_limit", "shoulder.stribeck_veloc
 
 def test_a_stand_in_is_off_in_every_value_that_has_to_be_identified_and_in_no_other() -> None:
     plant = load_mechanism("acrobot")
-    machine = stand_in_for(plant, share=0.1, delay=0.003, seed=4)
+    machine = surrogate_for(plant, share=0.1, delay=0.003, seed=4)
     assert machine.name == "acrobot_stand_in"
     off = {name: machine.numbers[name] / value - 1.0 for name, value in plant.numbers.items() if value}
     assert {name for name, share in off.items() if share == 0.0} == set(GIVEN) | {"elbow.stribeck_velocity"}
     assert max(map(abs, off.values())) <= 0.1
     assert machine.value("elbow.transport_delay") == 0.003
-    assert stand_in_for(plant, share=0.1, delay=0.003, seed=4) == machine
-    assert stand_in_for(plant, share=0.1, delay=0.003, seed=5) != machine
-    assert stand_in_for(plant, share=0.0, delay=0.0, seed=4).numbers == plant.numbers
+    assert surrogate_for(plant, share=0.1, delay=0.003, seed=4) == machine
+    assert surrogate_for(plant, share=0.1, delay=0.003, seed=5) != machine
+    assert surrogate_for(plant, share=0.0, delay=0.0, seed=4).numbers == plant.numbers
 
 
 @pytest.mark.parametrize(
@@ -73,7 +73,7 @@ def test_one_controller_holds_both_sides_upright_and_frequencies_are_those_of_an
         assert "controller:='mpc'" in run.controller_program().ros_arguments()
         record = run.metadata()[RUN_RECORD]
         assert record["controller"]["kind"] == "mpc"
-        assert stands_in(record) is (side == "hw")
+        assert is_surrogate(record) is (side == "hw")
         started = run.plant_program(4).ros_arguments()
         assert any(("start:='top'" if side == "sim" else "initial_positions:=[0.0, 3.14159") in one for one in started)
         measured, _ = Multisine().specs(run, run)
@@ -92,7 +92,7 @@ def test_a_multisine_begins_at_the_inverse_of_its_period_and_lasts_for_those_ave
 @pytest.mark.parametrize("share", [-0.1, 1.0, float("nan")])
 def test_a_share_that_makes_no_plant_is_refused(share: float) -> None:
     with pytest.raises(ParameterError, match=r"share is .*; expected 0 to less than 1"):
-        stand_in_for(load_mechanism("cart_pole"), share=share, delay=0.0, seed=1)
+        surrogate_for(load_mechanism("cart_pole"), share=share, delay=0.0, seed=1)
 
 
 def test_the_noise_is_on_the_first_driven_joint_unless_another_is_named() -> None:
@@ -110,11 +110,11 @@ def test_the_noise_is_on_the_first_driven_joint_unless_another_is_named() -> Non
 )
 def test_a_machine_with_other_equations_or_other_motors_is_refused(plant: str, other: str, message: str) -> None:
     with pytest.raises(ParameterError, match=message):
-        load_stand_in(other, load_mechanism(plant))
+        load_surrogate(other, load_mechanism(plant))
 
 
 def test_a_machine_with_other_values_is_taken() -> None:
-    assert load_stand_in("acrobot_frictionless", load_mechanism("acrobot")).name == "acrobot_frictionless"
+    assert load_surrogate("acrobot_frictionless", load_mechanism("acrobot")).name == "acrobot_frictionless"
 
 
 def _longest_time_upright(plant: PlantParameters, design: PlantParameters, amplitude: float) -> float:

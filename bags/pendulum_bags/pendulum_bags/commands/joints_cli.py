@@ -90,8 +90,8 @@ def joints(
         default_amplitude,
         design_file,
         design_for,
-        load_stand_in,
-        stand_in_for,
+        load_surrogate,
+        surrogate_for,
     )
     from pendulum_bags.experiments.settings import NoiseSettings
     from pendulum_bags.frequency_response.designs import read_designs
@@ -113,7 +113,9 @@ def joints(
     simulated = load_mechanism(plant)
     is_drawn = hardware == "emulator"
     machine = (
-        stand_in_for(simulated, share=share, delay=delay, seed=seed) if is_drawn else load_stand_in(hardware, simulated)
+        surrogate_for(simulated, share=share, delay=delay, seed=seed)
+        if is_drawn
+        else load_surrogate(hardware, simulated)
     )
     driven = len(simulated.coordinates.driven)
     if design and driven != 1:

@@ -215,8 +215,8 @@ def _print_summary(console: Console, comparison: Comparison, hardware: str) -> N
     if summary["runs"] > 1:
         title += f", all samples of {summary['runs']} runs"
     plants = summary["plants"]
-    stands_in = "emulator" if hardware in HARDWARE else "a simulation"
-    headings = [f"hw ({stands_in})" if name == "hw" and emulated else name for name in plants]
+    surrogate = "emulator" if hardware in HARDWARE else "a simulation"
+    headings = [f"hw ({surrogate})" if name == "hw" and emulated else name for name in plants]
     rows = (
         (r"noise recorded \[s]", "duration_s", ".1f"),
         (r"rate \[Hz]", "rate_hz", ".1f"),

@@ -30,7 +30,7 @@ from pendulum_bags.runs.run_data import (
     read_run,
 )
 from pendulum_bags.runs.run_folder import pair_folders, read_looks, read_stalls
-from pendulum_bags.runs.run_record import DIFFERENCE, STAND_IN, run_record
+from pendulum_bags.runs.run_record import DIFFERENCE, SURROGATE, run_record
 from pendulum_msgs_py.errors import BagError, DataError
 from pendulum_msgs_py.json_values import without_nan
 from pendulum_rosbag.reader import read_bag
@@ -80,7 +80,7 @@ class Comparison:
         notes = []
         for run in (self.pairs[0].simulation, self.pairs[0].hardware):
             record = run_record(run.metadata)
-            simulation = record.get("simulation") if run.label == "simulation" or STAND_IN in record else None
+            simulation = record.get("simulation") if run.label == "simulation" or SURROGATE in record else None
             if isinstance(simulation, Mapping) and (difference := simulation.get(DIFFERENCE)):
                 notes.append(f"The {run.label}, {simulation.get('name')}, {difference}.")
             if run.is_whole and not self.left_out:

@@ -27,9 +27,9 @@ __all__ = [
     "driven_joint",
     "fall_time",
     "identified_names",
-    "load_stand_in",
+    "load_surrogate",
     "require_upright",
-    "stand_in_for",
+    "surrogate_for",
 ]
 
 Array = NDArray[Any]
@@ -150,7 +150,7 @@ def identified_names(plant: PlantParameters) -> list[str]:
     return [name for name in plant.numbers if name.rpartition(".")[2] not in {*_UNCHANGED, _DELAY}]
 
 
-def stand_in_for(plant: PlantParameters, *, share: float, delay: float, seed: int) -> PlantParameters:
+def surrogate_for(plant: PlantParameters, *, share: float, delay: float, seed: int) -> PlantParameters:
     """Return a surrogate of a machine, with values as far off as an identification may leave them.
 
     ``share`` is the largest relative error of a mass, length, inertia or friction, drawn uniformly; ``delay`` the
@@ -191,7 +191,7 @@ def design_file(folder: Path, plant: str) -> str:
     return str(write_plant(folder / "design.yaml", designed, provenance={"design_of": meaning}))
 
 
-def load_stand_in(path: str | Path, plant: PlantParameters) -> PlantParameters:
+def load_surrogate(path: str | Path, plant: PlantParameters) -> PlantParameters:
     """Return the surrogate in a file or preset; a ParameterError if its equations or joints differ from ``plant``."""
     found = load_mechanism(path)
     for what, ours, others in (

@@ -11,7 +11,7 @@ from typing import Any
 from pendulum_bags.experiments.simulation import ForeignSimulation, absolute_plant
 from pendulum_bags.runs.case import IDENTITY, plant_identity
 from pendulum_bags.runs.run_folder import provenance
-from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
+from pendulum_bags.runs.run_record import RUN_RECORD, SURROGATE
 from pendulum_lqr.controller_interface.controller import controller_parameters
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS
 from pendulum_lqr.policies.policy_file import policy_record
@@ -260,7 +260,7 @@ class RunSpec:
                 "emulated_plant": self.plant if self.has_bridge else "",
                 IDENTITY: self.identity,
                 **({} if foreign is None else {"simulation": foreign.to_json()}),
-                **({STAND_IN: "simulation"} if self.side == "hw" and foreign is not None else {}),
+                **({SURROGATE: "simulation"} if self.side == "hw" and foreign is not None else {}),
                 "namespace": self.namespace,
                 "disturbance": self.disturbance_parameters(),
                 "controller": {"kind": self.controller, **self.controller_parameters},

@@ -19,7 +19,7 @@ from pendulum_bags.experiments.run_spec import (
 from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.case import IDENTITY, identity_of
 from pendulum_bags.runs.run_folder import provenance
-from pendulum_bags.runs.run_record import RUN_RECORD, STAND_IN
+from pendulum_bags.runs.run_record import RUN_RECORD, SURROGATE
 from pendulum_lqr.controller_interface.controller import controller_parameters
 from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy, policy_record
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -209,8 +209,8 @@ class RegulationSettings:
     @property
     def can_repeat(self) -> bool:
         """Whether both sides can be recorded again with new noise, in lockstep and without an operator."""
-        stands_in = self.hardware == "emulator" or self.foreign_of("hw") is not None
-        return stands_in and self.running("sim") is None
+        is_surrogate = self.hardware == "emulator" or self.foreign_of("hw") is not None
+        return is_surrogate and self.running("sim") is None
 
     @property
     def is_emulated(self) -> bool:
@@ -306,7 +306,7 @@ class RegulationSettings:
                 **policy_record(self.tuning),
                 **provenance(),
                 **({} if foreign is None else {"simulation": foreign.to_json()}),
-                **({STAND_IN: "simulation"} if side == "hw" and self.foreign_of("hw") is not None else {}),
+                **({SURROGATE: "simulation"} if side == "hw" and self.foreign_of("hw") is not None else {}),
                 **({} if (machine := self.machine) is None else {"lab": dict(machine.lab.values)}),
                 **more,
             }

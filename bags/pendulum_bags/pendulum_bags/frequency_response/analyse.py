@@ -20,7 +20,7 @@ from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.identification.joint_recordings import matched_joints
 from pendulum_bags.recordings.reading import Reading
 from pendulum_bags.runs.case import IDENTITY, Case
-from pendulum_bags.runs.run_record import run_record, stands_in
+from pendulum_bags.runs.run_record import is_surrogate, run_record
 from pendulum_bags.verdict import LayerResult, name_in
 from pendulum_lqr.linear.design import output_lqr
 from pendulum_lqr.linear.model import linearise
@@ -63,7 +63,7 @@ def read_responses(paths: Sequence[Path | Reading]) -> tuple[list[MeasuredRespon
         plant = _design_plant(reading.path, facts) or plant
         policies |= dict.fromkeys(policies_of(facts))
         measured = estimate(record)
-        added = {"emulated": label == "hw" and stands_in(facts), IDENTITY: facts.get(IDENTITY, "")}
+        added = {"emulated": label == "hw" and is_surrogate(facts), IDENTITY: facts.get(IDENTITY, "")}
         found.append(replace(measured, label=label, facts={**measured.facts, **added}))
     if len(found) == 2 and found[0].label == found[1].label:
         # Two of one kind: their order decides which is the reference.

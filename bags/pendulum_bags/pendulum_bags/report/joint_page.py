@@ -19,7 +19,7 @@ from pendulum_bags.report.joint_figures import joint_differences, joint_spectra,
 from pendulum_bags.report.page import Page, facts_of_tests
 from pendulum_bags.report.provenance import provenance_table, seed_of, settings_table
 from pendulum_bags.report.tables import tests_table
-from pendulum_bags.runs.run_data import stand_in_of, timing_warning
+from pendulum_bags.runs.run_data import surrogate_of, timing_warning
 from pendulum_bags.verdict import Answer
 
 __all__ = ["joint_page", "of_joint"]
@@ -63,7 +63,7 @@ def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: 
         animation=joint_animation(comparisons, str(data.run.get("design_plant", ""))),
         notes=[*([warning] if warning else []), *dict.fromkeys(n for c in comparisons.values() for n in c.left_out)],
         runs=len(first.pairs),
-        stand_in=stand_in_of(first.pairs[0].hardware),
+        surrogate=surrogate_of(first.pairs[0].hardware),
         missing=[("Difference under the same noise", differences)] if isinstance(differences, str) else [],
     )
 

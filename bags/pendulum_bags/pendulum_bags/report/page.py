@@ -15,7 +15,7 @@ from pendulum_bags.pages.html import render, script_json
 from pendulum_bags.report.animation import animation_of
 from pendulum_bags.report.data import ReportData
 from pendulum_bags.report.provenance import emulator_table, provenance_table, seed_of, settings_table
-from pendulum_bags.runs.run_data import stand_in_of, timing_warning
+from pendulum_bags.runs.run_data import surrogate_of, timing_warning
 from pendulum_bags.verdict import Answer
 from pendulum_bags.verdict.naming import name_in
 from pendulum_bags.verdict.terminal import SIGNS
@@ -68,7 +68,7 @@ class Page:
         figures: Figures, drawn on the page by a script.
         tables: Tables.
         provenance: Tables of where the data come from.
-        stand_in: The surrogate of the hardware where none was measured.
+        surrogate: The surrogate of the hardware where none was measured.
         animation: Output of :func:`pendulum_bags.report.animation.animation_of`; None for no animation.
         missing: Figures that the data do not allow, each with the reason.
         runs: How many runs there are; sections that show the first of several have a note.
@@ -86,7 +86,7 @@ class Page:
     figures: Sequence[Figure]
     tables: Sequence[Table]
     provenance: Sequence[Table]
-    stand_in: str
+    surrogate: str
     animation: Mapping[str, Any] | None = None
     notes: Sequence[str] = ()
     missing: Sequence[tuple[str, str]] = ()
@@ -133,7 +133,7 @@ def page_of(
         runs=len(comparison.pairs),
         unpaired=comparison.unpaired_verdict.sentence,
         noise_note=_noise_note(data),
-        stand_in=stand_in_of(comparison.pairs[0].hardware),
+        surrogate=surrogate_of(comparison.pairs[0].hardware),
     )
 
 

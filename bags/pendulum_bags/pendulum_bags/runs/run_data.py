@@ -19,7 +19,7 @@ from pendulum_bags.recordings.reading import Reading, holds_states
 from pendulum_bags.runs.correlation import effective_size
 from pendulum_bags.runs.datasets import check_consistency, data_notes, recording_of, unwrap
 from pendulum_bags.runs.moving_reference import follows_reference, recorded_reference
-from pendulum_bags.runs.run_record import STAND_IN, run_record, stands_in
+from pendulum_bags.runs.run_record import SURROGATE, is_surrogate, run_record
 from pendulum_bags.runs.series import Series, Signal, unwrap_near_upright
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import UPRIGHT
@@ -44,7 +44,7 @@ __all__ = [
     "plant_summary",
     "read_run",
     "shared_joints",
-    "stand_in_of",
+    "surrogate_of",
     "timing_warning",
 ]
 
@@ -440,7 +440,7 @@ def plant_summary(run: RunData) -> dict[str, Any]:
 
 def is_emulated(run: RunData) -> bool:
     """Return whether the run says that an emulator, or a second simulation, stood in for the hardware."""
-    return stands_in(run_record(run.metadata))
+    return is_surrogate(run_record(run.metadata))
 
 
 def is_in_lockstep(run: RunData) -> bool:
@@ -449,13 +449,13 @@ def is_in_lockstep(run: RunData) -> bool:
     return record.get("clock", "lockstep" if record.get("experiment") == "joints" else "") == "lockstep"
 
 
-def stand_in_of(run: RunData) -> str:
+def surrogate_of(run: RunData) -> str:
     """Return what stood in for the hardware of a run in which no machine was measured.
 
     Args:
         run: The hardware's side.
     """
-    simulated = run_record(run.metadata).get(STAND_IN) == "simulation"
+    simulated = run_record(run.metadata).get(SURROGATE) == "simulation"
     return "a second simulation" if simulated else "an emulator"
 
 

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-__all__ = ["DIFFERENCE", "RUN_RECORD", "STAND_IN", "record_named", "run_record", "stands_in"]
+__all__ = ["DIFFERENCE", "RUN_RECORD", "SURROGATE", "is_surrogate", "record_named", "run_record"]
 
 RUN_RECORD = "pendulum.run"
 """Name of the record among a bag's metadata; ``RunSpec`` and the settings of experiments write it."""
 DIFFERENCE = "difference"
 """Entry of a record's simulation: how it moves otherwise than the equation of the design."""
-STAND_IN = "stand_in"
+SURROGATE = "stand_in"
 """Entry of the record that says what stood in for the hardware: ``simulation``, where a second one did."""
 
 
@@ -24,9 +24,9 @@ def run_record(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
     return record_named(metadata, RUN_RECORD)
 
 
-def stands_in(record: Mapping[str, Any]) -> bool:
+def is_surrogate(record: Mapping[str, Any]) -> bool:
     """Return whether an emulator, or a second simulation, took the place of the hardware in a run."""
-    return record.get("plant") == "emulator" or STAND_IN in record
+    return record.get("plant") == "emulator" or SURROGATE in record
 
 
 def record_named(metadata: Mapping[str, Any], name: str) -> Mapping[str, Any]:
