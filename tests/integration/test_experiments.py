@@ -19,7 +19,7 @@ import pytest
 
 from pendulum_bags.commands.experiment_cli import main
 from pendulum_bags.experiments import lockstep
-from pendulum_bags.experiments.host_pool import HostedProgram, HostPool, keep_pool
+from pendulum_bags.experiments.host_pool import HostedProgram, HostPool, share_pool
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.orchestrator_node import Orchestrator, PlantClient, RecorderClient
 from pendulum_bags.experiments.run_spec import RunSpec
@@ -65,7 +65,7 @@ def _program(name: str) -> psutil.Process:
 @pytest.fixture(scope="module", autouse=True)
 def kept_hosts(hosts: HostPool) -> Iterator[None]:
     """Let all runs that a test carries out in its own process use the hosts of tests, commands of ours among them."""
-    with keep_pool(hosts):
+    with share_pool(hosts):
         yield
 
 

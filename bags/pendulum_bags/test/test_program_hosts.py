@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_bags.experiments.host_pool import HostedProgram, HostPool, keep_pool, kept_pool, open_pool
+from pendulum_bags.experiments.host_pool import HostedProgram, HostPool, open_pool, share_pool, shared_pool
 from pendulum_bags.experiments.processes import ProcessSet
 from pendulum_msgs_py.errors import FaultError
 from pendulum_msgs_py.programs.realtime import may_run_in_real_time
@@ -284,7 +284,7 @@ def test_what_is_no_program_of_ours_gets_a_process_of_its_own(pool: HostPool, tm
 
 
 def test_a_program_uses_the_hosts_that_outlive_it_or_ends_its_own(pool: HostPool, tmp_path: Path) -> None:
-    with keep_pool(pool):
+    with share_pool(pool):
         with open_pool() as kept:
             assert kept is pool
         program = _start(pool, tmp_path / "log", "tell")
@@ -337,4 +337,4 @@ def test_a_host_is_no_program_for_a_person() -> None:
     )
     assert (done.returncode, done.stdout) == (2, "")
     assert "expected the number of a socket" in done.stderr
-    assert kept_pool() is None
+    assert shared_pool() is None

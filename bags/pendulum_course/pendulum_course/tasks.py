@@ -31,7 +31,7 @@ CAUSES = {
     "samples": "fewer samples in a second make the estimate of a standard deviation smaller",
 }
 """Explanations that the fourth exercise offers; the first is the right one."""
-_KEPT_FROM_THESIS = 0.05
+_LEAST_DIFFERENCE = 0.05
 """Least distance of the first exercise's time constant from the thesis's, which the documentation has [s]."""
 _THESIS_TIME_CONSTANT = 0.372
 _LIMITS = {
@@ -78,7 +78,7 @@ def draw_tasks(seed: int) -> Tasks:
     """Return the tasks of a seed."""
     generator = np.random.default_rng([seed, 1])
     choices = np.round(np.arange(0.15, 0.81, 0.05), 2)
-    choices = choices[abs(choices - _THESIS_TIME_CONSTANT) > _KEPT_FROM_THESIS]
+    choices = choices[abs(choices - _THESIS_TIME_CONSTANT) > _LEAST_DIFFERENCE]
     quick, calm = (_two_digits(low * (high / low) ** generator.uniform()) for low, high in _HARD)
     first = bool(generator.integers(2))
     return Tasks(

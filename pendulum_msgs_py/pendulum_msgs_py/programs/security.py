@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.errors import ParameterError
 
-__all__ = ["BESIDE_PLANTS", "NODES", "PLANTS", "Permissions", "enclaves", "granted", "policy"]
+__all__ = ["NODES", "OTHER_NODES", "PLANTS", "Permissions", "enclaves", "granted", "policy"]
 
 _PARAMETERS = (
     "~/describe_parameters", "~/get_parameter_types", "~/get_parameters", "~/get_type_description", "~/list_parameters",
@@ -157,7 +157,7 @@ NODES: dict[str, Permissions] = {
 PLANTS = {"/sim": "simulator", "/hw": "bridge"}
 """Namespace of each side, and its plant."""
 
-BESIDE_PLANTS = {"conductor": "/conductor", "console": "/console", "recorder": "/recorder"}
+OTHER_NODES = {"conductor": "/conductor", "console": "/console", "recorder": "/recorder"}
 """Nodes for all sides, in the root namespace, and the enclaves of their processes."""
 
 _SIDE_NODES = ("controller", "effort_controller", "disturbance", "recorder", "viewer", "markers")
@@ -188,7 +188,7 @@ def granted(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[s
         (side, node) for side, plant in sides.items() for node in (plant, *_WITH_PLANT.get(plant, ()), *_SIDE_NODES)
     ]
     with_parameters = [_resolve(node, "", side) for side, node in nodes if node not in _WITHOUT_PARAMETERS]
-    with_parameters += [f"/{node}" for node in BESIDE_PLANTS if node not in _WITHOUT_PARAMETERS]
+    with_parameters += [f"/{node}" for node in OTHER_NODES if node not in _WITHOUT_PARAMETERS]
 
     spoken: set[str] = set()  # the recordable topics, filled below
 
@@ -207,7 +207,7 @@ def granted(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[s
             return {_resolve(name.removeprefix(_SIDE), "", side) for side in around}
         return {_resolve(name, node, here)}
 
-    nodes += [("/", node) for node in BESIDE_PLANTS]
+    nodes += [("/", node) for node in OTHER_NODES]
     for here, node in nodes:
         spoken |= set().union(*(written_out(name, node, here) for name in NODES[node].publish))
     spoken -= {names.CLOCK, names.DIAGNOSTICS}
@@ -237,7 +237,7 @@ def enclaves(plants: Iterable[tuple[str, str]] = tuple(PLANTS.items())) -> dict[
     for full, allowed in granted(plants).items():
         space, _, node = full.rpartition("/")
         path = f"{space}/{_IN_PROCESS.get(node, node)}"
-        answer.setdefault(BESIDE_PLANTS.get(path[1:], path), {})[full] = allowed
+        answer.setdefault(OTHER_NODES.get(path[1:], path), {})[full] = allowed
     return answer
 
 

@@ -46,7 +46,7 @@ _LEAST_BETWEEN_LINES = 1.0
 """Time between two log lines about one mode [s]."""
 _DRIFT = 0.01
 """Relative drift of two clocks that is allowed between messages of the hold-to-run switch."""
-_LOOK = 0.02
+_POLL = 0.02
 """Poll period of e-stops and trajectories [s]; only the newest trajectory is read."""
 TRAJECTORY_AGE_LIMIT = 1.0
 """Largest difference between a trajectory's stamp and the plant's time [s]: an old one must not move a machine."""
@@ -133,7 +133,7 @@ class PlantInterface:
         self._trajectories = node.create_polled_input(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
         self._trajectories.watch()
         self._next_trajectory = 0.0
-        create_wall_timer(node, _LOOK, self._on_look)
+        create_wall_timer(node, _POLL, self._on_poll)
         node.create_service(SetBool, names.ARM, self._on_arm)
         node.create_service(Trigger, names.E_STOP_RESET, self._on_e_stop_reset)
         # Steady time: it must run while simulated time stands still, or the system clock is set back.
@@ -325,7 +325,7 @@ class PlantInterface:
         if answers and self.arrived_ns and self.statistics is not None:
             self.statistics.round_trip(self.arrived_ns - self.published_ns)
 
-    def _on_look(self) -> None:
+    def _on_poll(self) -> None:
         if self._pressed.is_set():
             self._pressed.clear()
             self.publish_diagnostics()

@@ -53,7 +53,7 @@ _LARGEST_HEAP_BLOCK = 128 * 1024
 _ECHO_TIME = 1.0
 """Time within which a repeated stop signal counts as an echo of the first [s]."""
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-_KEPT_OPEN: list[socket.socket] = []
+_OPEN_SOCKETS: list[socket.socket] = []
 """Write ends of the signal sockets: the garbage collector would close them."""
 
 
@@ -243,9 +243,9 @@ def _listen_for_stop_signals() -> socket.socket:
     writer.setblocking(False)
     signal.set_wakeup_fd(writer.fileno(), warn_on_full_buffer=False)
     # Those of an earlier node in this process: ends its thread.
-    while _KEPT_OPEN:
-        _KEPT_OPEN.pop().close()
-    _KEPT_OPEN.append(writer)
+    while _OPEN_SOCKETS:
+        _OPEN_SOCKETS.pop().close()
+    _OPEN_SOCKETS.append(writer)
     for stop_signal in _STOP_SIGNALS:
         # nohup ignores a closed terminal.
         if stop_signal is not signal.SIGHUP or signal.getsignal(stop_signal) is not signal.SIG_IGN:

@@ -121,7 +121,7 @@ def compare(
     """
     from pendulum_bags.comparison import Margins, compare_folders, compare_runs
     from pendulum_bags.frequency_response.designs import designs_table
-    from pendulum_bags.runs.kept_bags import KeptBags
+    from pendulum_bags.runs.cached_bags import CachedBags
     from pendulum_bags.runs.run_data import joints_of, shared_joints
     from pendulum_bags.verdict.terminal import print_answer
     from pendulum_msgs_py.programs.terminal import make_console
@@ -129,7 +129,7 @@ def compare(
     margins = Margins.of(margins_file, margin)
     readings: Sequence[Reading] = ()
     # What was guessed is shown where it ends in an error, too.
-    with ExitStack() as guesses, KeptBags() as bags:
+    with ExitStack() as guesses, CachedBags() as bags:
         if all((path / "sim").is_dir() and (path / "hw").is_dir() for path in paths):
             run = partial(compare_folders, paths, margin=margins)
             joints = dict.fromkeys(joints_of(paths[0] / "sim", open_bag=bags))
@@ -163,7 +163,7 @@ def compare(
         answer, content, certified = _judge(results, kept, machine, design or ())
     run_folder = paths[0] if len(paths) == 1 else paths[0].parent
     of_run = len(paths) == 1 or [*paths] == [run_folder / "sim", run_folder / "hw"]
-    margins_kept = margins.keep(run_folder) if margins.stated and of_run else None
+    margins_file = margins.keep(run_folder) if margins.stated and of_run else None
     if out is not None:
         _write(out, results, content)
     if json_output:
@@ -177,8 +177,8 @@ def compare(
     if certified:
         console.print(designs_table(certified))
     print_answer(console, answer)
-    if margins_kept:
-        print(f"margins {margins_kept} (report uses them)")
+    if margins_file:
+        print(f"margins {margins_file} (report uses them)")
     if out is not None:
         print(f"\nwritten: {out / 'comparison.json'} and figures beside it")
 

@@ -248,7 +248,7 @@ def lockstep(
 
     Example: python -m pendulum_bags experiment lockstep --bag /tmp/seed_7 --seed 7
     """
-    from pendulum_bags.experiments.host_pool import kept_pool
+    from pendulum_bags.experiments.host_pool import shared_pool
     from pendulum_bags.experiments.lockstep import run_lockstep
 
     if side not in {"sim", "hw"}:
@@ -272,7 +272,7 @@ def lockstep(
         refuse_existing(bag)
         settings = replace(settings, plant=made)
     started = time.monotonic()
-    run_lockstep(bag, settings, side=side, domain=domain, hosts=kept_pool())
+    run_lockstep(bag, settings, side=side, domain=domain, hosts=shared_pool())
     elapsed = time.monotonic() - started
     print(f"{bag}: {duration:g} s simulated in {elapsed:.1f} s, starting the nodes included", file=sys.stderr)
 

@@ -81,7 +81,7 @@ def report(
     from pendulum_bags.recordings.reading import GUESS_HEAD, guess_rows
     from pendulum_bags.report import write_report
     from pendulum_bags.report.write import margin_of, write_joint_report
-    from pendulum_bags.runs.kept_bags import KeptBags
+    from pendulum_bags.runs.cached_bags import CachedBags
     from pendulum_bags.runs.run_data import joints_of, shared_joints
     from pendulum_bags.verdict.answer import answer_of
 
@@ -124,7 +124,7 @@ def report(
         guessed = [Table("What was guessed", sentence, GUESS_HEAD, shown, "Provenance")] if rows else []
         return replace(page, provenance=[*guessed, *page.provenance])
 
-    with KeptBags() as bags:
+    with CachedBags() as bags:
         names = shared_joints(readings, open_bag=bags) if readings else {}
         if joints := tuple(names) if readings else joints_of(folders[0] / "sim", open_bag=bags):
             if trials or machine or design or recording:

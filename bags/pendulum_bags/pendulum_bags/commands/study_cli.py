@@ -179,7 +179,7 @@ def run(
 
     Example: python -m pendulum_bags experiment run run.json --bag /tmp/bag
     """
-    from pendulum_bags.experiments.host_pool import kept_pool
+    from pendulum_bags.experiments.host_pool import shared_pool
     from pendulum_bags.experiments.lockstep import record_run
     from pendulum_bags.experiments.machine import record_listed
     from pendulum_bags.experiments.run_spec import RunSpec
@@ -191,7 +191,7 @@ def run(
         values = json.loads(spec.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise ParameterError(f"run file {spec} cannot be read: {error}") from error
-    record_run(bag, RunSpec.from_json(values), hosts=kept_pool())
+    record_run(bag, RunSpec.from_json(values), hosts=shared_pool())
 
 
 def _study(

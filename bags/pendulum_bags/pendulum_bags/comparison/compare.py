@@ -19,7 +19,7 @@ from pendulum_bags.comparison.metrics import episode_of, summarise_metrics
 from pendulum_bags.comparison.operating_band import Band
 from pendulum_bags.comparison.pairs import Difference, Pair, distribution_tests, interpolated_difference
 from pendulum_bags.comparison.same_run import Looks, paired_tests, unpaired_tests
-from pendulum_bags.runs.kept_bags import KeptBags
+from pendulum_bags.runs.cached_bags import CachedBags
 from pendulum_bags.runs.run_data import (
     OpenBag,
     RunData,
@@ -297,7 +297,7 @@ def compare_joints(
         margin: What difference does not matter.
         looks: Number of interim analyses.
     """
-    with KeptBags() as bags:
+    with CachedBags() as bags:
         more: dict[str, Any] = {"margin": margin, "looks": looks, **({"open_bag": bags} if any(joints) else {})}
         return {joint: compare_folders(folders, joint=joint or None, **more) for joint in joints}
 

@@ -25,7 +25,7 @@ def decide(
     deadline: Deadline | None,
     *,
     joints: Sequence[str] = ("",),
-    on_look: Callable[[int, float], None] = lambda number, duration: None,
+    on_repeat: Callable[[int, float], None] = lambda number, duration: None,
     on_comparison: Callable[[Mapping[str, Comparison]], None] = lambda found: None,
     record: Callable[[Path, RegulationSettings | JointSettings, int, Deadline], None] = record_repeat,
 ) -> Mapping[str, Comparison]:
@@ -40,7 +40,7 @@ def decide(
         margins: Differences that do not matter.
         deadline: Of the repeats; None for one analysis of the existing recordings.
         joints: Joints of plants of several; else one without a name.
-        on_look: Called with the number of a repeat and its duration of noise [s] before it is recorded.
+        on_repeat: Called with the number of a repeat and its duration of noise [s] before it is recorded.
         on_comparison: Called with the comparison of each joint after each analysis.
         record: Records the missing parts of a repeat, or raises BudgetSpentError.
     """
@@ -63,7 +63,7 @@ def decide(
         if _is_decided(compared) or 1.5 * slowest > left:
             return compared
         number += 1
-        on_look(number, repeat_settings(settings, number).noise.duration)
+        on_repeat(number, repeat_settings(settings, number).noise.duration)
         try:
             record(folder, settings, number, deadline)
             deadline.require(_COMPARING * len(joints))

@@ -18,7 +18,7 @@ from types import TracebackType
 
 from pendulum_bags.experiments.bound_process import start_bound_process
 
-__all__ = ["AGAIN", "BEGUN", "LAST", "HostPool", "HostedProgram", "keep_pool", "kept_pool", "open_pool"]
+__all__ = ["AGAIN", "BEGUN", "LAST", "HostPool", "HostedProgram", "open_pool", "share_pool", "shared_pool"]
 
 BEGUN = "begun"
 """Line that a host sends when its program accepts signals."""
@@ -185,29 +185,29 @@ def _end(hosts: Sequence[_Host]) -> None:
             host.process.wait()
 
 
-_kept: list[HostPool] = []
+_shared: list[HostPool] = []
 
 
 @contextlib.contextmanager
-def keep_pool(pool: HostPool) -> Iterator[None]:
+def share_pool(pool: HostPool) -> Iterator[None]:
     """Let successive programs in this process share their hosts."""
-    _kept.append(pool)
+    _shared.append(pool)
     try:
         yield
     finally:
-        _kept.remove(pool)
+        _shared.remove(pool)
 
 
-def kept_pool() -> HostPool | None:
+def shared_pool() -> HostPool | None:
     """Return the hosts that outlive the running program, for another one in this process; else None."""
-    return _kept[-1] if _kept else None
+    return _shared[-1] if _shared else None
 
 
 @contextlib.contextmanager
 def open_pool() -> Iterator[HostPool]:
     """Provide the hosts that outlive the running program, or new ones that end with it."""
-    if (kept := kept_pool()) is not None:
-        yield kept
+    if (shared := shared_pool()) is not None:
+        yield shared
         return
     with HostPool() as pool:
         yield pool

@@ -168,7 +168,7 @@ def _has_reached(plant: PlantClient, end_ns: int) -> bool:
 def _wait_for_end(orchestrator: Orchestrator, plant: PlantClient, duration: float) -> None:
     """Wait for the end of a run in lockstep, on a busy machine too, as long as it progresses."""
     orchestrator.wait_for("the first state", lambda: plant.is_heard or _is_finished(plant), START_TIMEOUT)
-    plant.look_away()
+    plant.stop_watching()
     recorder, received = RecorderClient(orchestrator, plant.namespace), 0
     states = f"{plant.namespace}/{names.JOINT_STATES}"
     while not _is_finished(plant):

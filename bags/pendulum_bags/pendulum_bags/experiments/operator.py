@@ -94,14 +94,14 @@ def confirmed(
         yield
         return
     console = make_console(stderr=True, highlight=False)
-    with _kept_settings(machine, console):
+    with _saved_settings(machine, console):
         run_checklist(bridge, console, flat=flat)
         ask_yes(machine, plan, console, yes=yes)
         yield
 
 
 @contextlib.contextmanager
-def _kept_settings(machine: RealMachine, console: Console) -> Iterator[None]:
+def _saved_settings(machine: RealMachine, console: Console) -> Iterator[None]:
     """Save gains, safety parameters and M-stop action of the module, and always restore them."""
     folder = Path(tempfile.mkdtemp(prefix="pendulum_module_")) / "before"
     console.print("keeping the module's settings ...", style="dim")

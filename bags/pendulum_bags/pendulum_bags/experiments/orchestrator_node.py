@@ -123,8 +123,8 @@ class Orchestrator:
         self._executor.spin_until_future_complete(Future(executor=None) if until is None else until, duration)
         # A pause of this program does not count.
         self.listened += min(duration, time.monotonic() - began)
-        for look in self.after_listening:
-            look()
+        for check in self.after_listening:
+            check()
 
     def _slice(self, duration: float, until: Future | None = None) -> None:
         self.listen(duration, until)
@@ -188,16 +188,16 @@ class PlantClient:
         self._watching = self.orchestrator.node.create_polled_input(
             JointState, f"{self.namespace}/{names.JOINT_STATES}", qos.NEWEST_STATE
         )
-        self.orchestrator.after_listening.append(self._look)
+        self.orchestrator.after_listening.append(self._poll)
 
-    def look_away(self) -> None:
+    def stop_watching(self) -> None:
         """Unsubscribe from its states: receiving them costs a tenth of a run in lockstep."""
         if self._watching is not None:
-            self.orchestrator.after_listening.remove(self._look)
+            self.orchestrator.after_listening.remove(self._poll)
             self.orchestrator.node.destroy_polled_input(self._watching)
             self._watching = None
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         if self._watching is not None:
             self._watching.take(self._on_state)
 

@@ -21,7 +21,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from pendulum_bags.experiments.host_pool import AGAIN, BEGUN, LAST, HostPool, keep_pool
+from pendulum_bags.experiments.host_pool import AGAIN, BEGUN, LAST, HostPool, share_pool
 from pendulum_msgs_py.programs.executables import EXIT_USAGE, run_package
 from pendulum_msgs_py.programs.realtime import priority_kept
 from pendulum_msgs_py.programs.starter import end_with_starter
@@ -44,7 +44,7 @@ def main() -> int:
     with (
         socket.socket(fileno=int(sys.argv[1])) as connection,
         HostPool() as pool,
-        keep_pool(pool),
+        share_pool(pool),
         connection.makefile("r", encoding="utf-8") as orders,
     ):
         for number, line in enumerate(orders, 1):

@@ -35,7 +35,7 @@ __all__ = [
     "RAMP_SPEED",
     "RAMP_SPEEDS",
     "SETTLE_TIME",
-    "TIME_BESIDE_NOISE",
+    "TIME_WITHOUT_NOISE",
     "NoiseSettings",
     "RegulationSettings",
 ]
@@ -45,7 +45,7 @@ _MODEL_FILES = (".xml", ".mjcf", ".urdf")
 DEFAULT_STRATEGY = "direct_pwm"
 SETTLE_TIME = 1.0
 """Time under control before the noise starts [s]."""
-TIME_BESIDE_NOISE = 47.0
+TIME_WITHOUT_NOISE = 47.0
 """Wall time of the thesis's experiment without its noise, measured on two cores; 31 s are the ramps [s]."""
 RAMP_SPEED = RAMP_INCREMENT / RAMP_PERIOD
 """Mean speed of the thesis's ramp [rad/s]."""
@@ -225,7 +225,7 @@ class RegulationSettings:
     @property
     def expected_wall_time(self) -> float:
         """Wall time of the thesis's experiment, measured on two cores [s]."""
-        return TIME_BESIDE_NOISE + self.noise.duration + 2.0 * (self.ramp_time - UPRIGHT / RAMP_SPEED)
+        return TIME_WITHOUT_NOISE + self.noise.duration + 2.0 * (self.ramp_time - UPRIGHT / RAMP_SPEED)
 
     def ramp(self, start: float, goal: float) -> Trajectory:
         """Return the thesis's ramp between two positions [rad], at the speed of these settings."""

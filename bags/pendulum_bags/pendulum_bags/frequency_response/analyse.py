@@ -72,10 +72,10 @@ def read_responses(paths: Sequence[Path | Reading]) -> tuple[list[MeasuredRespon
 
 
 def _read(path: Reading) -> tuple[Record, Mapping[str, Any]]:
-    from pendulum_bags.runs.kept_bags import KeptBags
+    from pendulum_bags.runs.cached_bags import CachedBags
     from pendulum_bags.runs.run_data import joints_of, read_run
 
-    with KeptBags() as bags:
+    with CachedBags() as bags:
         joints = joints_of(path, open_bag=bags)
         if not joints:
             run = read_run(path, or_all=not path.is_bag, open_bag=bags)

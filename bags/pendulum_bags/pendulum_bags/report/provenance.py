@@ -94,15 +94,15 @@ def _runs(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
 
 def _made_with(pair: Pair) -> str:
     """Return with which software a run was recorded, for each side where they differ."""
-    by_side = {}
+    by_label = {}
     for one in (pair.simulation, pair.hardware):
         record = run_record(one.metadata)
         versions = record.get("versions")
         software = [("git", record.get("git_revision", "unknown"))]
         software += versions.items() if isinstance(versions, Mapping) else ()
-        by_side[one.label] = ", ".join(f"{name} {version}" for name, version in software)
-    texts = set(by_side.values())
-    return texts.pop() if len(texts) == 1 else "; ".join(f"{label}: {text}" for label, text in by_side.items())
+        by_label[one.label] = ", ".join(f"{name} {version}" for name, version in software)
+    texts = set(by_label.values())
+    return texts.pop() if len(texts) == 1 else "; ".join(f"{label}: {text}" for label, text in by_label.items())
 
 
 def seed_of(run: RunData) -> str:

@@ -24,10 +24,10 @@ __all__ = [
     "carry_out",
     "chunk_path",
     "cluster_client",
-    "kept_settings",
     "open_results",
     "read_columns",
     "run_chunks",
+    "stored_settings",
     "write_columns",
     "write_results_marker",
 ]
@@ -196,7 +196,7 @@ def open_results(folder: Path, what: str, fingerprint: str, settings: Mapping[st
     write_results_marker(folder, fingerprint, settings)
 
 
-def kept_settings(folder: Path, fingerprint: str) -> dict[str, Any]:
+def stored_settings(folder: Path, fingerprint: str) -> dict[str, Any]:
     """Return the settings that a folder of results was made with; none where it has another fingerprint, or none."""
     try:
         found = json.loads((folder / _MARKER).read_text(encoding="utf-8"))

@@ -22,10 +22,10 @@ from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.studies.chunks import (
     Connect,
     chunk_path,
-    kept_settings,
     open_results,
     read_columns,
     run_chunks,
+    stored_settings,
     write_results_marker,
 )
 from pendulum_bags.studies.closed_loops import ClosedLoops, Columns
@@ -206,7 +206,7 @@ def run_monte_carlo(
         ParameterError: A drawn plant has no positive inertia.
     """
     fingerprint, content = settings.fingerprint(), settings.content()
-    before = int(kept_settings(folder, fingerprint).get("runs", settings.runs))
+    before = int(stored_settings(folder, fingerprint).get("runs", settings.runs))
     if before > settings.runs:
         raise BagError(
             f"folder {folder} holds a Monte Carlo of {before} runs; expected at most the {settings.runs} of this one"

@@ -16,7 +16,7 @@ from typing import Any
 import yaml
 
 from pendulum_bags.experiments.run_spec import CLOCKS, PERIODS, RunSpec
-from pendulum_bags.experiments.settings import TIME_BESIDE_NOISE
+from pendulum_bags.experiments.settings import TIME_WITHOUT_NOISE
 from pendulum_bags.studies.located import LocatedMapping
 from pendulum_lqr.controller_interface.controller import controller_class
 from pendulum_lqr.policies.policy_file import load_policy
@@ -356,7 +356,7 @@ def _named_runs(
             arguments += _thesis_arguments(controllers[controller], controller, disturbances[disturbance])
             duration = _duration(file)
             arguments += ["--duration", repr(duration)]
-            seconds, size = TIME_BESIDE_NOISE + duration, _THESIS_BYTES
+            seconds, size = TIME_WITHOUT_NOISE + duration, _THESIS_BYTES
         else:
             arguments += ["--trials", str(trials), *(["--realtime"] if clock == "realtime" else [])]
             seconds, size = trials * _TRIAL_SECONDS[experiment], trials * _TRIAL_BYTES[experiment]

@@ -356,7 +356,7 @@ class _Run:
             self.order.margins,
             deadline,
             joints=self.order.joints,
-            on_look=lambda number, duration: self._phase(f"undecided: {duration:.0f} s more", 4.0 + 0.25 * duration),
+            on_repeat=lambda number, duration: self._phase(f"undecided: {duration:.0f} s more", 4.0 + 0.25 * duration),
             on_comparison=take,
             record=self._repeat,
         )

@@ -49,7 +49,7 @@ from pendulum_rosbag.recorder.parameter_reader_node import ParameterReader
 
 __all__ = ["Hub", "main"]
 
-_LOOK_PERIOD = 0.3
+_POLL_PERIOD = 0.3
 _SLICE = 0.2
 _TIMEOUT = 3.0
 """Longest wait for a response of a node [s]."""
@@ -97,7 +97,7 @@ class Hub:
         self._described: dict[tuple[str, ...], dict[str, Description]] = {}
         self._reader = ParameterReader(self._node, lambda _values, _changed: None)
         self._node.create_subscription(DiagnosticArray, names.DIAGNOSTICS, self._on_diagnostics, qos.DIAGNOSTICS)
-        self._node.create_timer(_LOOK_PERIOD, self._look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._node.create_timer(_POLL_PERIOD, self._poll, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._done = Future(executor=None)
         self._executor = EventsExecutor(context=self._context)
         self._executor.add_node(self._node)
@@ -328,7 +328,7 @@ class Hub:
             except Exception as error:  # noqa: BLE001
                 self._node.get_logger().error(f"{type(error).__name__}: {error}", throttle_duration_sec=1.0)
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         self._reader.poll(forget=True)
         found = {
             name.removesuffix(_STOP_SERVICE)

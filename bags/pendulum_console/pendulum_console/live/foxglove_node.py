@@ -35,7 +35,7 @@ __all__ = ["LiveNode", "LiveOptions"]
 
 _TAKE_PERIOD = 0.02
 """Period of polling the middleware [s]: a video frame, long enough to send several messages together."""
-_LOOK_PERIOD = 0.3
+_POLL_PERIOD = 0.3
 _TIMEOUT = 3.0
 """Longest wait for a response of a node [s]."""
 _NO_PLANT_AFTER = 3.0
@@ -93,8 +93,8 @@ class LiveNode(PollingNode):
             self._server.stop()
             raise
         self.port = self._gate.port
-        self._look()
-        create_wall_timer(self, _LOOK_PERIOD, self._look)
+        self._poll()
+        create_wall_timer(self, _POLL_PERIOD, self._poll)
         create_wall_timer(self, _TAKE_PERIOD, self._take)
 
     def close(self) -> None:
@@ -122,7 +122,7 @@ class LiveNode(PollingNode):
         self._sent += topic.sent
         self._lost += topic.lost
 
-    def _look(self) -> None:
+    def _poll(self) -> None:
         self._reader.poll()
         there = {name: types for name, types in self.get_topic_names_and_types() if self.count_publishers(name)}
         for name, types in there.items():
@@ -139,10 +139,10 @@ class LiveNode(PollingNode):
             self._leave(self._topics.pop(name))
         for topic in self._topics.values():
             topic.poll()
-        self._look_for_services()
-        self._look_for_plants()
+        self._find_services()
+        self._find_plants()
 
-    def _look_for_plants(self) -> None:
+    def _find_plants(self) -> None:
         plants = {name.removesuffix(_E_STOP) for name in self._callable if name.endswith(_E_STOP)}
         for plant in sorted(plants - self._plants):
             print(f"plant {plant}", flush=True)
@@ -161,7 +161,7 @@ class LiveNode(PollingNode):
             self._no_plant_reported = True
             self._server.publish_status(text, foxglove.StatusLevel.Warning, "no plant")
 
-    def _look_for_services(self) -> None:
+    def _find_services(self) -> None:
         own = f"{self.get_fully_qualified_name()}/"
         there = {
             name: types[0]

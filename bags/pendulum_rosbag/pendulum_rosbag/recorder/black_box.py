@@ -28,7 +28,7 @@ class BlackBox(Generic[_Source]):
     """Messages of the last ``seconds`` from any sources, in at most ``max_bytes`` of memory."""
 
     def __init__(self, seconds: float, max_bytes: int = MAX_BYTES) -> None:
-        self._kept_ns = round(seconds * NANOSECONDS)
+        self._length_ns = round(seconds * NANOSECONDS)
         self._max_bytes = max_bytes
         self._messages: deque[tuple[_Source, int, bytes]] = deque()
         self._bytes = 0
@@ -56,7 +56,7 @@ class BlackBox(Generic[_Source]):
 
     def is_due(self, now_ns: int) -> bool:
         """Drop messages that are too old; return whether the rest is to be written now."""
-        oldest_ns = now_ns - self._kept_ns
+        oldest_ns = now_ns - self._length_ns
         while self._messages and self._messages[0][1] < oldest_ns:
             self._bytes -= len(self._messages.popleft()[2])
         return self._due_ns is not None and now_ns >= self._due_ns

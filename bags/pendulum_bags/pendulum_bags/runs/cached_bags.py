@@ -9,10 +9,10 @@ from types import TracebackType
 
 from pendulum_rosbag.reader import Bag, read_bag
 
-__all__ = ["KeptBags"]
+__all__ = ["CachedBags"]
 
 
-class KeptBags:
+class CachedBags:
     """Opens each bag once; called as :func:`read_bag` is, within a ``with`` block that closes all of them."""
 
     def __init__(self) -> None:
@@ -26,7 +26,7 @@ class KeptBags:
             self._bags[place] = self._open.enter_context(read_bag(place))
         return nullcontext(self._bags[place])
 
-    def __enter__(self) -> KeptBags:
+    def __enter__(self) -> CachedBags:
         return self
 
     def __exit__(
