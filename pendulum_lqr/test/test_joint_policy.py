@@ -65,7 +65,7 @@ def test_a_sample_holds_each_signal_of_the_joints_that_have_it_signal_by_signal(
         rows.append([-math.cos(angle), -math.sin(angle), x / 0.5, v / 2.0, rate / 5.0, efforts[-1] / 10.0])
         efforts += learned.efforts(0.01 * k, (x, angle), (v, rate))
     whole = np.array([[*rows[0], *rows[0]], [*rows[0], *rows[1]]], dtype=np.float32)
-    assert efforts[1:] == pytest.approx(10.0 * policy.network.answer(whole)[:, 0], abs=1e-4)
+    assert efforts[1:] == pytest.approx(10.0 * policy.network.forward(whole)[:, 0], abs=1e-4)
 
 
 def test_each_driven_joint_gets_its_own_answer_within_its_own_limit_and_rate(tmp_path):
@@ -187,7 +187,7 @@ def test_torque_begins_at_zero_and_states_at_another_rate_make_it_give_up(tmp_pa
     assert all(effort <= 10.0 * 0.01 * k / 0.2 + 1e-12 for k, effort in enumerate(efforts))
     for k in range(40):
         learned.efforts(1.0 + 0.02 * k, *STILL)
-    assert "states come every 0.02 s; it answers for every 0.01 s" in learned.notice
+    assert "states come every 0.02 s; the policy expects 0.01 s" in learned.notice
 
 
 def test_faster_states_get_each_answer_as_often_and_other_periods_are_refused(tmp_path):

@@ -102,7 +102,7 @@ def test_a_policy_is_the_same_law_as_its_network(tmp_path, simulate):
     first, second = (learned.command(0.01 * k, x) for k, x in enumerate([(0.3, 1.0), (0.31, -1.0)]))
     row = [[math.cos(0.3), math.sin(0.3), 1.0, 0.0], [math.cos(0.31), math.sin(0.31), -1.0, first / 1.5]]
     whole = np.array([[*row[0], *row[0]], [*row[0], *row[1]]], dtype=np.float32)
-    expected = 1.5 * network.network.answer(whole)[:, 0]
+    expected = 1.5 * network.network.forward(whole)[:, 0]
     assert (first, second) == (pytest.approx(expected[0], abs=1e-5), pytest.approx(expected[1], abs=1e-5))
 
 
@@ -178,7 +178,7 @@ def test_states_at_another_rate_than_said_make_it_give_up(tmp_path, period):
     efforts = [learned.command(period * k, (0.1, 0.0)) for k in range(40)]
     assert efforts[0] != 0.0
     assert efforts[-1] == 0.0
-    assert f"states come every {period:g} s; it answers for every 0.01 s" in learned.notice
+    assert f"states come every {period:g} s; the policy expects 0.01 s" in learned.notice
     # A state that is late, or lost, now and then is no other rate.
     learned.reset()
     for k in range(200):
@@ -211,7 +211,7 @@ def test_a_network_that_overflows_gives_up_and_never_answers_nan(tmp_path):
     policy = random_policy(DFKI, history=1)
     learned = LearnedPolicy(type(policy)(**{**policy.__dict__, "network": network}), 1, (1.5,))
     assert learned.command(0.0, (0.3, 2.0)) == 0.0
-    assert "its network answered" in learned.notice
+    assert "its network returned" in learned.notice
     with pytest.raises(DataError, match="test vectors come out wrong"):
         loads_policy(dumps_policy(learned.policy))
 

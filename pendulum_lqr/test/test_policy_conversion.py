@@ -107,14 +107,14 @@ def test_a_cosine_from_hanging_another_order_and_stacked_samples_come_out_the_sa
     policy = policy_of_actor(unbound, told, name="x", provenance={})
     theirs = np.random.default_rng(0).uniform(-1.0, 1.0, (50, 3)).astype(np.float32)
     ours = np.stack([-theirs[:, 1], -theirs[:, 2], theirs[:, 0]], axis=1)
-    np.testing.assert_allclose(policy.network.answer(ours), actor.network.answer(theirs), atol=1e-6)
+    np.testing.assert_allclose(policy.network.forward(ours), actor.network.forward(theirs), atol=1e-6)
     stacked = policy_of_actor(
         unbound,
         ActorSpec(PENDULUM_V1, 0.05, observation="velocity", history=3, velocity_box=8.0),
         name="x",
         provenance={},
     )
-    np.testing.assert_array_equal(stacked.network.answer(theirs), actor.network.answer(theirs))
+    np.testing.assert_array_equal(stacked.network.forward(theirs), actor.network.forward(theirs))
 
 
 @pytest.mark.parametrize(

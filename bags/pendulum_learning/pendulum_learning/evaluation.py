@@ -165,7 +165,7 @@ def gymnasium_return(policy: Policy, episodes: int, seed: int) -> tuple[float, f
         total, over = 0.0, False
         while not over:
             x = np.array([seen[0], seen[1], seen[2] / policy.velocity_scale[0]], dtype=np.float32)
-            seen, reward, _, over, _ = env.step(policy.effort_limit[0] * policy.network.answer(x))
+            seen, reward, _, over, _ = env.step(policy.effort_limit[0] * policy.network.forward(x))
             total += float(reward)
         returns.append(total)
     env.close()

@@ -80,7 +80,7 @@ class Imitation:
         seen, taught, rewards = [], [], []
         for _ in range(self.settings.horizon):
             observed, _ = env.observe()
-            efforts, cost = self.teacher.answer(env.states)
+            efforts, cost = self.teacher.output(env.states)
             right = (efforts / env.limit).astype(np.float32)
             near = cost < _LOST
             seen.append(observed[near])

@@ -18,10 +18,10 @@ from pendulum_lqr.swing_up.stored_swing_up import tracked_swing_up
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["Teacher", "TeacherAnswers"]
+__all__ = ["Teacher", "TeacherOutput"]
 
 
-class TeacherAnswers(NamedTuple):
+class TeacherOutput(NamedTuple):
     """A teacher's output for N states.
 
     Attributes:
@@ -61,13 +61,13 @@ class Teacher:
         # A unit vector times these is a deviation of cost 1.
         self._roots = np.linalg.inv(np.linalg.cholesky(self._costs)).transpose(0, 2, 1)
 
-    def answer(self, states: Array) -> TeacherAnswers:
+    def output(self, states: Array) -> TeacherOutput:
         """Return the efforts for deviations from upright and velocities, shape (N, 2n)."""
         nearest, cost = _nearest(states, self.states, self._costs, self._turns)
         error = states - self.states[nearest]
         error[:, self._turns] = wrap(error[:, self._turns])
         efforts = self.efforts[nearest] - np.einsum("kij,kj->ki", self._gains[nearest], error)
-        return TeacherAnswers(np.clip(efforts, -self._limits, self._limits), cost)
+        return TeacherOutput(np.clip(efforts, -self._limits, self._limits), cost)
 
     def around(self, nodes: NDArray[np.intp], cost: float, generator: np.random.Generator) -> tuple[Array, Array]:
         """Return random states around nodes, up to a cost, and the efforts that act there: those of the node before."""

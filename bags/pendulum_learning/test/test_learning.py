@@ -101,7 +101,7 @@ def test_what_a_policy_sees_and_does_in_training_is_what_it_sees_and_does_as_a_c
         x = (env.motion[0, 0] + math.pi) % (2.0 * math.pi) - math.pi
         assert math.cos(x - rows[0, k]) == pytest.approx(1.0, abs=1e-7)
         assert env.motion[0, 1] == pytest.approx(rows[1, k], abs=2e-4)
-        env.step(policy.network.answer(env.observe()[0]))
+        env.step(policy.network.forward(env.observe()[0]))
         assert env.effort[0] == pytest.approx(rows[2, k], abs=2e-4)
 
 

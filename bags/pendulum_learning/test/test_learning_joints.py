@@ -68,7 +68,7 @@ def test_what_a_policy_of_several_joints_sees_in_training_is_what_it_sees_as_a_c
         turned = env.motion[0, 1] - rows[1, k]
         assert math.remainder(turned, 2.0 * math.pi) == pytest.approx(0.0, abs=2e-3)
         assert env.motion[0, [0, 2, 3]] == pytest.approx(rows[[0, 2, 3], k], abs=2e-3)
-        env.step(policy.network.answer(env.observe()[0]))
+        env.step(policy.network.forward(env.observe()[0]))
         assert env.effort[0] == pytest.approx(rows[4, k], abs=2e-2)
 
 

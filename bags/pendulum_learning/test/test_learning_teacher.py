@@ -48,7 +48,7 @@ class Asked:
     def efforts(self, _t, position, velocity):
         if self.count % 2 == 0:
             x = deviation_of(self.plant.coordinates, position + velocity)
-            self.held = tuple(self.teacher.answer(x[None]).efforts[0])
+            self.held = tuple(self.teacher.output(x[None]).efforts[0])
         self.count += 1
         return self.held
 
@@ -63,11 +63,11 @@ def test_a_teacher_that_knows_the_state_alone_scores_as_the_swing_up_that_knows_
 def test_on_its_way_a_teacher_answers_with_the_swing_up_s_efforts_however_often_a_joint_has_turned(teacher):
     turned = teacher.states + np.array([2.0 * math.pi, -4.0 * math.pi, 0.0, 0.0])
     for states in (teacher.states, turned):
-        found = teacher.answer(states)
+        found = teacher.output(states)
         np.testing.assert_allclose(found.efforts, np.clip(teacher.efforts, -6.0, 6.0), atol=1e-6)
         np.testing.assert_allclose(found.cost, 0.0, atol=1e-9)
-    np.testing.assert_array_equal(teacher.answer(np.zeros((1, 4))).efforts, 0.0)
-    far = teacher.answer(np.random.default_rng(0).normal(0.0, 5.0, (200, 4)))
+    np.testing.assert_array_equal(teacher.output(np.zeros((1, 4))).efforts, 0.0)
+    far = teacher.output(np.random.default_rng(0).normal(0.0, 5.0, (200, 4)))
     assert np.median(far.cost) > 6.0
     assert np.abs(far.efforts).max() == 6.0
 
@@ -76,7 +76,7 @@ def test_states_around_the_way_are_as_near_as_was_asked_for(teacher):
     nodes = np.arange(len(teacher.states))
     states, efforts = teacher.around(nodes, 0.5, np.random.default_rng(0))
     # Another node may be nearer still.
-    cost = teacher.answer(states).cost
+    cost = teacher.output(states).cost
     assert 0.2 < cost.max() <= 0.5 + 1e-9
     np.testing.assert_array_equal(efforts[1:], teacher.efforts[:-1])
     np.testing.assert_array_equal(efforts[0], 0.0)
@@ -85,7 +85,7 @@ def test_states_around_the_way_are_as_near_as_was_asked_for(teacher):
 def test_a_network_learns_what_its_teacher_does_and_starts_along_its_way(teacher):
     env = SwingUp(64, PENDUBOT, {}, TASK, np.random.default_rng(0))
     learner = Imitation(env, PpoSettings(hidden=(32, 32), horizon=16), np.random.default_rng(1), teacher)
-    assert teacher.answer(env.states).cost.max() <= 2.0 + 1e-9
+    assert teacher.output(env.states).cost.max() <= 2.0 + 1e-9
     # From 0.8 on nobody is led any more: all errors are those on the pupil's own states.
     errors = [learner.update(0.8 - number / 50)["divergence"] for number in range(40)]
     assert np.mean(errors[-5:]) < 0.5 * np.mean(errors[:5])
@@ -98,9 +98,9 @@ def test_episodes_start_at_hanging_upright_and_on_the_way_and_who_strays_starts_
     assert all(0.03 < share < 0.3 for share in ends)
     astray = np.tile([2.0, 2.0, 0.0, 0.0], (400, 1))
     env.start_at(np.arange(400), astray, np.zeros((400, 1)))
-    assert teacher.answer(env.states).cost.min() > 6.0
+    assert teacher.output(env.states).cost.min() > 6.0
     learner.update()
-    assert teacher.answer(env.states).cost.max() < 6.0
+    assert teacher.output(env.states).cost.max() < 6.0
 
 
 def test_an_episode_that_starts_elsewhere_knows_the_effort_that_acts_there():

@@ -32,8 +32,8 @@ def policy_specs(fallbacks: Sequence[str]) -> tuple[ParameterSpec, ...]:
     """Return the parameters of a controller that runs a policy file; ``fallbacks`` starts with ``ZERO``."""
     return (
         ParameterSpec("policy", "", "", "Policy file (.npz)."),
-        ParameterSpec("fallback", ZERO, "", "Who answers where the policy gives up: zero torque, or a controller at "
-                      "its defaults.", choices=tuple(fallbacks)),
+        ParameterSpec("fallback", ZERO, "", "Command after the policy gives up: zero torque, or a controller's at its "
+                      "defaults.", choices=tuple(fallbacks)),
         ParameterSpec("start_time", START_TIME, "s", "Time in which the torque that it may ask for rises from zero to "
                       "its limit, after the first state; 0 for at once.", minimum=0.0, maximum=5.0),
     )  # fmt: skip
@@ -91,7 +91,7 @@ class PolicyRunner:
         self._wait = 0
         self._times: list[float] = []
 
-    def answer(self, t: float, x: Vector, v: Vector) -> Vector | None:
+    def efforts(self, t: float, x: Vector, v: Vector) -> Vector | None:
         """Return the efforts of the driven joints, or None once it has given up [N m or N].
 
         Args:
@@ -109,16 +109,16 @@ class PolicyRunner:
             self._wait -= 1
             return self._effort
         self._wait = self.hold - 1
-        answers = self._network(x, v)
-        for each in answers:
+        outputs = self._network(x, v)
+        for each in outputs:
             if not math.isfinite(each):
-                self._give_up(t, f"its network answered {each}")
+                self._give_up(t, f"its network returned {each}")
                 return None
         wanted = []
-        for answer, scale, before, step in zip(
-            answers, self.policy.effort_limit, self._effort, self._steps, strict=True
+        for output, scale, before, step in zip(
+            outputs, self.policy.effort_limit, self._effort, self._steps, strict=True
         ):
-            wanted.append(before + min(step, max(-step, scale * answer - before)))
+            wanted.append(before + min(step, max(-step, scale * output - before)))
         self._effort = self.begun(t, wanted)
         return self._effort
 
@@ -126,17 +126,17 @@ class PolicyRunner:
         """Record efforts that another controller applied in place of the last command [N m or N]."""
         self._effort = efforts
 
-    def fall_back(self, t: float, state: Sequence[float], answer: Callable[[], Sequence[float]] | None) -> Vector:
+    def fall_back(self, t: float, state: Sequence[float], fallback: Callable[[], Sequence[float]] | None) -> Vector:
         """Return the efforts of a fallback, with soft start; zero without one, or if state or efforts are not finite.
 
         Args:
             t: Time since the start [s].
             state: Input of the fallback; checked, since limits would turn NaN into a full effort.
-            answer: Calls the fallback.
+            fallback: Calls the fallback controller.
         """
-        if answer is None or not all(map(math.isfinite, state)):
+        if fallback is None or not all(map(math.isfinite, state)):
             return self._still
-        efforts = answer()
+        efforts = fallback()
         return self.begun(t, efforts) if all(map(math.isfinite, efforts)) else self._still
 
     def begun(self, t: float, efforts: Sequence[float]) -> Vector:
@@ -199,10 +199,10 @@ class PolicyRunner:
                 y = np.maximum(y, 0.0) if self._relu else np.tanh(y)
         return [self._bounded(each) for each in y.tolist()]
 
-    def _bounded(self, answer: float) -> float:
-        if not math.isfinite(answer):
-            return answer
-        return math.tanh(answer) if self._squash else min(1.0, max(-1.0, answer))
+    def _bounded(self, output: float) -> float:
+        if not math.isfinite(output):
+            return output
+        return math.tanh(output) if self._squash else min(1.0, max(-1.0, output))
 
     def _watch_box(self, t: float, x: Vector, v: Vector) -> None:
         boxes = zip(x, v, self.policy.angle_box, self.policy.velocity_box, strict=True)
@@ -225,7 +225,7 @@ class PolicyRunner:
         self._times = [t]
         if not abs(median * self.hold / self.policy.period - 1.0) <= _LATE:
             own = self.policy.period / self.hold
-            self._give_up(t, f"states come every {median:.3g} s; it answers for every {own:.3g} s")
+            self._give_up(t, f"states come every {median:.3g} s; the policy expects {own:.3g} s")
 
     def _give_up(self, t: float, reason: str) -> None:
         self.notice = f"gave up after {t:.3f} s: {reason}"

@@ -63,8 +63,8 @@ class LearnedPolicy(Controller):
         catch: MechanismCatch | None = None,
         plant: PlantParameters | None = None,
     ) -> None:
-        self._answers = PolicyRunner(policy, hold, effort_limits, start_time)
-        super().__init__(self._answers.limits)
+        self._runner = PolicyRunner(policy, hold, effort_limits, start_time)
+        super().__init__(self._runner.limits)
         self.policy, self.fallback, self.catch = policy, fallback, catch
         self.plant = plant or policy.plant
         self._deviation = policy.coordinates.deviation
@@ -108,11 +108,11 @@ class LearnedPolicy(Controller):
     @property
     def notice(self) -> str:
         """Why it gave up, or empty."""
-        return self._answers.notice
+        return self._runner.notice
 
     @notice.setter
     def notice(self, text: str) -> None:
-        self._answers.notice = text
+        self._runner.notice = text
 
     def check(self, period: float) -> None:
         """Refuse a period that is no whole fraction of the policy's, or at which catch or fallback are unstable [s]."""
@@ -126,7 +126,7 @@ class LearnedPolicy(Controller):
 
     def reset(self) -> None:
         """Forget the past, including having given up."""
-        self._answers.reset()
+        self._runner.reset()
         if self.catch is not None:
             self.catch.active = False
         if self.fallback is not None:
@@ -134,30 +134,30 @@ class LearnedPolicy(Controller):
 
     def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
         """Return the policy's efforts, the catch's near upright, or the fallback's after it gave up [N m or N]."""
-        efforts = self._answers.answer(t, self._deviation(position), velocity)
+        efforts = self._runner.efforts(t, self._deviation(position), velocity)
         if efforts is None:
             fallback = self.fallback
             ask = None if fallback is None else lambda: fallback.efforts(t, position, velocity)
-            efforts = self._answers.fall_back(t, position + velocity, ask)
+            efforts = self._runner.fall_back(t, position + velocity, ask)
         elif self.catch is not None:
             x = deviation_of(self.policy.coordinates, position + velocity)
             if self.catch.holds(x):
                 # The network's samples contain the applied efforts: it may have to continue from here.
-                efforts = self._answers.begun(t, self.catch.command(x))
-                self._answers.follow(efforts)
+                efforts = self._runner.begun(t, self.catch.command(x))
+                self._runner.follow(efforts)
         return efforts
 
     def describe(self) -> str:
         """Return policy, catch, and whether it gave up."""
         nothing = "zero torque" if self.plant.is_pendulum else "no effort"
-        text = self._answers.describe(nothing if self.fallback is None else self.fallback.describe())
+        text = self._runner.describe(nothing if self.fallback is None else self.fallback.describe())
         return text if self.catch is None else f"{text}; LQR within {self.catch.region.describe()}"
 
     def take_over(self, previous: Controller) -> None:
         """Take over samples, efforts and notice from the same kind of policy."""
         if not isinstance(previous, LearnedPolicy):
             return
-        self._answers.take_over(previous._answers)
+        self._runner.take_over(previous._runner)
         if self.catch is not None and previous.catch is not None:
             self.catch.active = previous.catch.active
         if self.fallback is not None and previous.fallback is not None:

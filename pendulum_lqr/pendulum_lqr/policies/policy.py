@@ -103,7 +103,7 @@ class Network:
         """Number of inputs of each layer, and of outputs of the last one."""
         return (self.weights[0].shape[1], *(weight.shape[0] for weight in self.weights))
 
-    def answer(self, observations: Floats) -> Floats:
+    def forward(self, observations: Floats) -> Floats:
         """Return the bounded output (..., out) for observations (..., in); NaN and infinity pass through."""
         x = observations
         last = len(self.weights) - 1

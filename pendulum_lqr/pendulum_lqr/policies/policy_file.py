@@ -73,7 +73,7 @@ def dumps_policy(policy: Policy) -> bytes:
         arrays[f"weight_{k}"] = np.ascontiguousarray(weight, dtype=np.float32)
         arrays[f"bias_{k}"] = np.ascontiguousarray(bias, dtype=np.float32)
     arrays["test_observations"] = vectors
-    arrays["test_actions"] = network.answer(vectors)
+    arrays["test_actions"] = network.forward(vectors)
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         for name, array in arrays.items():
@@ -276,7 +276,7 @@ def _recompute(network: Network, observations: NDArray[Any], actions: NDArray[An
         raise DataError(f"test_observations has shape {observations.shape}; expected (k, {sizes[0]}) with k > 0")
     if actions.shape != (len(observations), sizes[-1]):
         raise DataError(f"test_actions has shape {actions.shape}; expected ({len(observations)}, {sizes[-1]})")
-    error = float(np.max(np.abs(network.answer(observations) - actions), initial=0.0))
+    error = float(np.max(np.abs(network.forward(observations) - actions), initial=0.0))
     if not error <= _TOLERANCE:
         raise DataError(f"its test vectors come out wrong by {error:.3g}; expected at most {_TOLERANCE:g}")
 
