@@ -64,7 +64,7 @@ class _Trial:
             lockstep_duration=self.duration,
         )
 
-    def controller_program(self) -> NodeProgram:
+    def controller_program(self, subscribers: int = 0) -> NodeProgram:
         return graph.controller(
             self.namespace,
             controller="policy",
@@ -72,9 +72,10 @@ class _Trial:
             plant=self.plant,
             period=self.period,
             use_sim_time=True,
+            lockstep_subscribers=subscribers,
         )
 
-    def disturbance_program(self) -> NodeProgram:
+    def disturbance_program(self, subscribers: int = 0) -> NodeProgram:
         return graph.disturbance(
             self.namespace,
             kind="pulse_train",
@@ -84,6 +85,7 @@ class _Trial:
             start_time=1.0,
             autostart=True,
             use_sim_time=True,
+            lockstep_subscribers=subscribers,
         )
 
 

@@ -12,6 +12,7 @@ from rclpy.parameter import Parameter
 from sensor_msgs.msg import JointState
 
 from pendulum_msgs_py.ros import qos
+from pendulum_msgs_py.ros.first_answer import FirstAnswer
 from pendulum_msgs_py.ros.simulated_time import live_by_stamps
 from pendulum_testing.fixtures import wait_for
 from pendulum_testing.graph_peer import GraphPeer
@@ -59,3 +60,16 @@ def test_in_real_time_a_node_is_left_as_it_is(make: Callable[[bool], Node]) -> N
     live_by_stamps(node, lambda: 5)
     assert list(node.timers) == []
     assert node.get_clock().now().nanoseconds > 1_500_000_000_000_000_000
+
+
+def test_the_first_reply_waits_for_a_recorder_that_its_own_graph_does_not_show_yet(domain_id: int) -> None:
+    with closing(GraphPeer("controller", domain=domain_id)) as peer:
+        publisher = peer.node.create_publisher(JointState, "effort_command", qos.COMMAND)
+        waiting, trusting = FirstAnswer(peer.node, publisher, 2), FirstAnswer(peer.node, publisher, 0)
+        peer.node.create_subscription(JointState, "effort_command", lambda _: None, qos.COMMAND)  # the plant
+        wait_for(lambda: publisher.get_subscription_count() == 1, 30.0, "the plant's match")
+        assert trusting.may_go()
+        assert not waiting.may_go()
+        peer.node.create_subscription(JointState, "effort_command", lambda _: None, qos.COMMAND)  # the recorder
+        wait_for(lambda: publisher.get_subscription_count() == 2, 30.0, "the recorder's match")
+        assert waiting.may_go()

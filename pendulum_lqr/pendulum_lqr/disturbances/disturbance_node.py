@@ -32,7 +32,7 @@ from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.compiled_answers import AnsweredInput
 from pendulum_msgs_py.ros.convert import event_message, stamp_of_state
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
-from pendulum_msgs_py.ros.first_answer import FirstAnswer
+from pendulum_msgs_py.ros.first_answer import LOCKSTEP_SUBSCRIBERS, FirstAnswer
 from pendulum_msgs_py.ros.leaving import wait_until_heard
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.polled import PollingNode
@@ -50,6 +50,7 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("joints", [""], "",
         "Joints to disturb, in the plant's order, each by its own signal with the next seed. "
         "Empty for the joint of a pendulum.", read_only=True),
+    LOCKSTEP_SUBSCRIBERS,
     COMPILED,
     REALTIME_PRIORITY,
 )  # fmt: skip
@@ -83,7 +84,7 @@ class DisturbanceNode(PollingNode):
         self._loop = self._loops[0]
         self._logged_others = False
         self._torque_publisher = self.create_publisher(JointState, names.DISTURBANCE, qos.COMMAND)
-        self._first_answer = FirstAnswer(self, self._torque_publisher)
+        self._first_answer = FirstAnswer(self, self._torque_publisher, self._settings["lockstep_subscribers"])
         self._event_publisher = self.create_publisher(String, names.EVENTS, qos.EVENTS)
         self._diagnostics = Diagnostics(self, "disturbance")
         self.create_service(Trigger, "~/start", self._on_start)

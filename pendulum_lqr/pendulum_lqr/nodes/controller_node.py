@@ -42,7 +42,7 @@ from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.compiled_answers import AnsweredInput
 from pendulum_msgs_py.ros.convert import problem_of_state, sample_from_bytes
 from pendulum_msgs_py.ros.diagnostics import DIAGNOSTICS_PERIOD, Diagnostics
-from pendulum_msgs_py.ros.first_answer import FirstAnswer
+from pendulum_msgs_py.ros.first_answer import LOCKSTEP_SUBSCRIBERS, FirstAnswer
 from pendulum_msgs_py.ros.leaving import wait_until_heard
 from pendulum_msgs_py.ros.lifecycle import LifecycleNode
 from pendulum_msgs_py.ros.parameters import NodeParameters
@@ -80,6 +80,7 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
         "autoactivate", True, "", "With autostart: activate too; false configures, and waits inactive for "
         "~/change_state.", read_only=True,
     ),
+    LOCKSTEP_SUBSCRIBERS,
     REALTIME_PRIORITY,
     COMPILED,
 )  # fmt: skip
@@ -131,7 +132,7 @@ class ControllerNode(LifecycleNode, PollingNode):
             self._command_publisher = self.create_publisher(Float64MultiArray, _MULTI_ARRAY_TOPIC, qos.COMMAND)
         else:
             self._command_publisher = self.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
-        self._first_answer = FirstAnswer(self, self._command_publisher)
+        self._first_answer = FirstAnswer(self, self._command_publisher, self._settings["lockstep_subscribers"])
         self._diagnostics = Diagnostics(self, "controller")
         source = self.create_waited_input(JointState, names.JOINT_STATES, qos.NEWEST_STATE, self._on_state)
         refusal = "" if self._settings["compiled"] else "compiled is false"

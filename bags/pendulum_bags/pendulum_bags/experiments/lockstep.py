@@ -121,7 +121,10 @@ def record_run(
     ):
         recorder = session.record(bag, namespace, spec.metadata(), spec.storage, simulated=simulated)
         program = spec.plant_program(_LISTENERS + 1)
-        answering = (spec.controller_program(), spec.disturbance_program())
+        answering = (
+            spec.controller_program(_RUN_LISTENERS[names.EFFORT_COMMAND]),
+            spec.disturbance_program(_RUN_LISTENERS[names.DISTURBANCE]),
+        )
         for node, priority in (*((each, ANSWER_PRIORITY) for each in answering), (program, PLANT_PRIORITY)):
             start_loop(session.processes, node, priority, simulated=simulated)
         plant = PlantClient(session.orchestrator, namespace, program.node_name, watch=False)

@@ -224,8 +224,8 @@ class RunSpec:
             return graph.simulator("/sim", rate_hz=1.0 / self.period, **loop)
         return graph.simulator("/sim", method=self.method, rate_hz=1.0 / self.period, **loop)
 
-    def controller_program(self) -> NodeProgram:
-        """Return the controller."""
+    def controller_program(self, subscribers: int = 0) -> NodeProgram:
+        """Return the controller; in lockstep it replies to ``subscribers`` at least."""
         return graph.controller(
             self.namespace,
             **{
@@ -237,13 +237,18 @@ class RunSpec:
                 "plant": absolute_plant(self.design_plant),
                 "period": self.period,
                 "use_sim_time": self.simulated_time,
+                "lockstep_subscribers": subscribers,
             },
         )
 
-    def disturbance_program(self) -> NodeProgram:
-        """Return the disturbance."""
+    def disturbance_program(self, subscribers: int = 0) -> NodeProgram:
+        """Return the disturbance; in lockstep it replies to ``subscribers`` at least."""
         return graph.disturbance(
-            self.namespace, **self.disturbance_parameters(), autostart=True, use_sim_time=self.simulated_time
+            self.namespace,
+            **self.disturbance_parameters(),
+            autostart=True,
+            use_sim_time=self.simulated_time,
+            lockstep_subscribers=subscribers,
         )
 
     def metadata(self) -> dict[str, Any]:
