@@ -87,15 +87,14 @@ def test_the_simulated_motion_is_that_of_scipy_under_an_input_that_comes_late_an
     plant = truth("double_pendulum").with_values({f"{j}.coulomb_friction": 0.0 for j in ("shoulder", "elbow")})
     names, delay, lag = ("shoulder.effort_offset", "elbow.angle_offset", DELAY, LAG), 0.0123, 0.03
     start = MechanismModel.of(plant)
-    values = start.values.copy()
-    values[start.index(names)] = 0.05, 0.1, delay, lag
+    changed = start.with_changes(dict(zip(names, (0.05, 0.1, delay, lag), strict=True)))
     period, held = 0.01, np.random.default_rng(4).uniform(-1.0, 1.0, (60, 2))
     one = both_driven[0]
     recording = replace(
         one, time=period * np.arange(60), position=one.position[:60], effort=held, hold=("zero", "zero")
     )
     data = prepare_windows(recording, 0.4).subset([0])
-    found = fit(start.with_values(values), [data], (), np.ones(2), states=[data.states], most=0)
+    found = fit(changed, [data], (), np.ones(2), states=[data.states], most=0)
     path = found.errors[0][0, :, :2] + data.position[0]
 
     def rate(t, x):
@@ -133,7 +132,7 @@ def test_a_step_in_which_joints_rest_and_break_away_ends_where_fifty_short_ones_
         drive[0, ..., 1] = effort[:, None] + rise[:, None] * step / pieces * np.arange(pieces)
         drive[0, ..., 3] = rise[:, None]
         run, steps = motion_kernel(model.plant.mechanism.name), np.full((count, pieces), step / pieces)
-        run(*model.tables(model.values[None]), drive, np.zeros(1, dtype=int), steps, states[None], path)
+        run(*model.tables(model.vector[None]), drive, np.zeros(1, dtype=int), steps, states[None], path)
         return path[0, :, -1]
 
     apart = np.abs(ends(1) - ends(50))[:, 2:].max(axis=1)

@@ -1,18 +1,30 @@
-"""Covariance of the parameters of one fitted candidate, and what fits without a part of the data add to it."""
+"""Covariance of fitted parameters, and of one joint what fits without a part of the data add to it."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.identification.arrowhead import M, Model, Motion
 from pendulum_bags.identification.model import INDEX, FitModel
-from pendulum_bags.identification.problem import Piece, longest_step, projected_sensitivities, simulate
+from pendulum_bags.identification.problem import Piece
 from pendulum_bags.identification.selection import Candidate, at_bounds
+from pendulum_bags.identification.solver import angle_motions
 
-__all__ = ["FREQUENCY", "Errors", "candidate_errors", "least_scale"]
+__all__ = [
+    "FREQUENCY",
+    "Errors",
+    "Information",
+    "candidate_errors",
+    "information",
+    "least_scale",
+    "standard_errors",
+    "without",
+]
 
 FREQUENCY = "natural_frequency"
 """Name of w0 = sqrt(G / J) among the parameters."""
@@ -42,38 +54,153 @@ class Errors:
 
 
 @dataclass(frozen=True)
-class _Information:
-    projected: list[Array]
-    residual: list[Array]
-    samples: int
-    states: int
+class Information:
+    """What a fit sees, by recording and window.
+
+    Attributes:
+        projected: Sensitivities to k parameters without what initial states and own offsets can take over, (n, k).
+        residual: Simulated minus measured, shape (n,).
+    """
+
+    projected: list[list[Array]]
+    residual: list[list[Array]]
+
+    @property
+    def windows(self) -> list[tuple[Array, Array]]:
+        """Sensitivities and residuals of each window."""
+        return [*zip(itertools.chain(*self.projected), itertools.chain(*self.residual), strict=True)]
+
+
+def information(
+    models: Sequence[M],
+    motions: Sequence[Motion[M]],
+    states: Sequence[Array],
+    free: Sequence[str],
+    own: Sequence[str] = (),
+) -> Information:
+    """Return what the motions of recordings show of free parameters; each recording has its ``own`` ones beside."""
+    k, projected, residuals = len(free), list[list[Array]](), list[list[Array]]()
+    for model, motion, x in zip(models, motions, states, strict=True):
+        sensitivities, errors = motion.sensitivities(model, x, (*free, *own))
+        rest = [without(each[:, k + len(own) :], each[:, : k + len(own)]) for each in sensitivities]
+        if own:
+            stacked = np.concatenate(rest)
+            follow = np.linalg.lstsq(stacked[:, k:], stacked[:, :k], rcond=None)[0]
+            rest = [each[:, :k] - each[:, k:] @ follow for each in rest]
+        projected.append(rest)
+        residuals.append(list(errors))
+    return Information(projected, residuals)
+
+
+def without(columns: Array, values: Array) -> Array:
+    """Return what some columns cannot take over of values, shape (n, k)."""
+    return np.asarray(values - columns @ np.linalg.lstsq(columns, values, rcond=None)[0])
+
+
+def standard_errors(
+    seen: Information,
+    model: Model,
+    names: Sequence[str],
+    *,
+    freedom: float,
+    size: Array | None = None,
+    scale: float = np.inf,
+    serial: bool,
+    clusters: bool,
+) -> Errors:
+    """Return the standard errors of parameters: the largest of those of white and of correlated residuals.
+
+    Args:
+        seen: Sensitivities and residuals.
+        model: The fit; what it knows beforehand counts as measured.
+        names: Parameters.
+        freedom: Measurements less what was fitted.
+        size: Scale of each parameter, for the condition number; by default its own error, were the others known.
+        scale: Of the robust loss.
+        serial: Whether to allow for residuals that are correlated within a window.
+        clusters: Whether to allow for what the residuals of a window have in common.
+
+    Source:
+        Huber, Robust Statistics, sec. 7.6; Newey and West, Econometrica 55, 1987; Liang and Zeger, Biometrika 73, 1986.
+    """
+    prior = model.prior(names)
+    stacked = np.concatenate(
+        [each for each, _ in seen.windows] + [np.diag(np.sqrt(prior.weights))[prior.weights > 0.0]]
+    )
+    psi, slope = _influence(np.concatenate([each for _, each in seen.windows]), scale)
+    weight = float(np.mean(slope))
+    squares = float(psi @ psi) + prior.cost(np.array([model[name] for name in names]))
+    if size is None:
+        norm = np.linalg.norm(stacked, axis=0)
+        size = np.array([1.0 / one if one > 0.0 else model.size(name) for one, name in zip(norm, names, strict=True)])
+    _, singular, right = np.linalg.svd(stacked * size, full_matrices=False)
+    condition = float(min(singular[0] / max(singular[-1], 1e-300), 1e150)) ** 2 if singular.size else 1.0
+    inverse = np.zeros((0, 0))
+    if names:
+        inverse = (right.T / np.maximum(singular, 1e-12 * max(singular[0], 1e-300)) ** 2) @ right * np.outer(size, size)
+    white = squares / max(freedom, 1.0) / weight**2 * inverse
+    bread = inverse / max(weight, 1e-3)
+    errors, count = [white], len(seen.windows)
+    serially, cluster = np.zeros_like(white), np.zeros_like(white)
+    for sensitivity, residual in seen.windows:
+        scores = sensitivity * _influence(residual, scale)[0][:, None]
+        if serial:
+            reach = max(1, len(scores) // 4)
+            # Sums over all stretches of that length weigh the lags as Bartlett does.
+            running = np.cumsum(np.pad(scores, ((reach + 1, reach), (0, 0))), axis=0)
+            blocks = running[reach + 1 :] - running[: -reach - 1]
+            serially += blocks.T @ blocks / (reach + 1)
+        total = scores.sum(axis=0)
+        cluster += np.outer(total, total)
+    if serial:
+        errors.append(bread @ serially @ bread)
+    if clusters and count > 1:
+        errors.append(bread @ (cluster * count / (count - 1) + np.diag(prior.weights)) @ bread)
+    before = np.sqrt(np.maximum(np.diag(white), 1e-300))
+    after = np.sqrt(np.max([np.maximum(np.diag(each), 0.0) for each in errors], axis=0))
+    return Errors(
+        tuple(names),
+        white * np.outer(after / before, after / before),
+        white,
+        dict(zip(names, after.tolist(), strict=True)),
+        dict(zip(names, before.tolist(), strict=True)),
+        right[-1] if names else np.zeros(0),
+        condition,
+    )
 
 
 def candidate_errors(candidate: Candidate, pieces: Sequence[Piece], scale: float, *, white: bool) -> Errors:
     """Return the standard errors of a candidate; of residuals that are not white, by clusters and a jackknife too."""
-    model = candidate.solution.model
+    model, states = candidate.solution.model, candidate.solution.states
     edges = set(at_bounds(candidate))
     names = tuple(n for n in candidate.free if n not in edges)
-    information = _information(model, pieces, candidate.solution.states, names)
-    plain, singular, condition = _white_covariance(information, scale, model, names)
-    # Even white residuals are not alike everywhere: near a reversal the fit bends, and the sandwich sees it.
-    linear = _sandwich(plain, information, scale, clusters=not white)
+    motions, measured = angle_motions(model, pieces, scale), sum(p.samples - 2 * len(p.windows) for p in pieces)
+
+    def errors_of(*some: str) -> Errors:
+        seen = information([model] * len(pieces), motions, states, some)
+        size = np.array([max(abs(model[name]), least_scale(name)) for name in some])
+        freedom = measured - len(some)
+        # Even white residuals are not alike everywhere: near a reversal the fit bends, and the sandwich sees it.
+        return standard_errors(
+            seen, model, some, freedom=freedom, size=size, scale=scale, serial=True, clusters=not white
+        )
+
+    found = errors_of(*names)
+    linear, plain = found.covariance, found.white
     # A friction that ended at 0 is not known to be 0: what it could take over from the others widens those.
     beside = tuple(n for n in ("damping", "coulomb_friction") if n in edges and model[n] <= 0.0)
     if beside and names:
-        information = _information(model, pieces, candidate.solution.states, (*names, *beside))
-        wide, _, _ = _white_covariance(information, scale, model, (*names, *beside))
-        linear = _sandwich(wide, information, scale, clusters=not white)[: len(names), : len(names)]
-        plain = wide[: len(names), : len(names)]
+        wide = errors_of(*names, *beside)
+        linear, plain = (each[: len(names), : len(names)] for each in (wide.covariance, wide.white))
     before = np.sqrt(np.maximum(np.diag(linear), 1e-300))
     after = before
     if not white and names:
         # Along a firm direction the fit is as good as linear, and the sandwich is its error; along a weak one it
         # is not, and only fits without a part of the data show how far it moves.
         after = np.maximum(before, _jackknife(candidate, lambda vector: vector[[INDEX[n] for n in names]]))
-    covariance = linear * np.outer(after / before, after / before) if names else linear
-    deviation = dict(zip(names, map(float, after), strict=True))
-    plain_deviation = dict(zip(names, map(float, np.sqrt(np.maximum(np.diag(plain), 0.0))), strict=True))
+    covariance = linear * np.outer(after / before, after / before)
+    deviation = dict(zip(names, after.tolist(), strict=True))
+    plain_deviation = dict(zip(names, np.sqrt(np.maximum(np.diag(plain), 0.0)).tolist(), strict=True))
     gradient = _frequency_gradient(model, names)
     if gradient is not None:
         # G and J move together: w0 has far less error than either, and a jackknife of its own.
@@ -82,7 +209,7 @@ def candidate_errors(candidate: Candidate, pieces: Sequence[Piece], scale: float
             error = max(error, float(_jackknife(candidate, _frequency_of)[0]))
         deviation[FREQUENCY] = error
         plain_deviation[FREQUENCY] = float(np.sqrt(max(float(gradient @ plain @ gradient), 0.0)))
-    return Errors(names, covariance, plain, deviation, plain_deviation, singular, condition)
+    return Errors(names, covariance, plain, deviation, plain_deviation, found.singular, found.condition)
 
 
 def _frequency_of(vector: Array) -> Array:
@@ -100,22 +227,6 @@ def _frequency_gradient(model: FitModel, names: Sequence[str]) -> Array | None:
     return gradient
 
 
-def _information(
-    model: FitModel, pieces: Sequence[Piece], states: Sequence[Array], names: Sequence[str]
-) -> _Information:
-    """Return, by window, the sensitivities with the window's initial state projected out, and the residuals."""
-    index = [INDEX[name] for name in names]
-    projected: list[Array] = []
-    residual: list[Array] = []
-    samples = 0
-    for piece, state in zip(pieces, states, strict=True):
-        result = simulate(model, piece, state, free=index, step=longest_step(model, piece.recording))
-        projected += projected_sensitivities(result, piece.windows)
-        residual += [result.theta[a:b] - piece.recording.position[a:b] for a, b in piece.windows]
-        samples += piece.samples
-    return _Information(projected, residual, samples, 2 * len(projected))
-
-
 def _influence(residual: Array, scale: float) -> tuple[Array, Array]:
     """Return psi(r), the derivative of the loss, and psi'(r)."""
     if not np.isfinite(scale):
@@ -124,55 +235,9 @@ def _influence(residual: Array, scale: float) -> tuple[Array, Array]:
     return residual / root, 1.0 / root**3
 
 
-def _white_covariance(
-    information: _Information, scale: float, model: FitModel, names: Sequence[str]
-) -> tuple[Array, Array, float]:
-    """Return the covariance for white residuals, the weakest direction (scaled), and the condition number."""
-    stacked = np.concatenate(information.projected)
-    residual = np.concatenate(information.residual)
-    psi, slope = _influence(residual, scale)
-    freedom = max(information.samples - information.states - len(names), 1)
-    variance = float(psi @ psi) / freedom / float(np.mean(slope)) ** 2
-    size = np.array([max(abs(model[name]), least_scale(name)) for name in names])
-    _, singular, right = np.linalg.svd(stacked * size, full_matrices=False)
-    condition = float(min(singular[0] / max(singular[-1], 1e-300), 1e150)) ** 2 if singular.size else 1.0
-    inverse = (
-        (right.T / np.maximum(singular, 1e-12 * max(singular[0], 1e-300)) ** 2) @ right if names else np.zeros((0, 0))
-    )
-    return variance * inverse * np.outer(size, size), right[-1] if len(names) else np.zeros(0), condition
-
-
 def least_scale(name: str) -> float:
     """Return the scale below which a parameter counts as 0, in its unit."""
     return {"transport_delay": 1e-3, "angle_offset": 1e-2, "torque_offset": 1e-2}.get(name, 1e-6)
-
-
-def _sandwich(white: Array, information: _Information, scale: float, *, clusters: bool) -> Array:
-    """Return the covariance raised to that of residuals correlated within windows: serially, and as clusters."""
-    if not white.size:
-        return white
-    stacked = np.concatenate(information.projected)
-    _, slopes = _influence(np.concatenate(information.residual), scale)
-    weight = max(float(np.mean(slopes)), 1e-3)
-    bread = np.linalg.pinv(weight * stacked.T @ stacked, rcond=1e-14)
-    serial, cluster = np.zeros_like(bread), np.zeros_like(bread)
-    for sensitivity, residual in zip(information.projected, information.residual, strict=True):
-        psi, _ = _influence(residual, scale)
-        scores = sensitivity * psi[:, None]
-        reach = max(1, len(psi) // 4)
-        # Sums over all stretches of that length weigh the lags as Bartlett does.
-        running = np.cumsum(np.pad(scores, ((reach + 1, reach), (0, 0))), axis=0)
-        blocks = running[reach + 1 :] - running[: -reach - 1]
-        serial += blocks.T @ blocks / (reach + 1)
-        total = scores.sum(axis=0)
-        cluster += np.outer(total, total)
-    count = len(information.projected)
-    errors = [white, bread @ serial @ bread]
-    if clusters and count > 1:
-        errors.append(bread @ cluster @ bread * count / (count - 1))
-    old = np.sqrt(np.maximum(np.diag(white), 1e-300))
-    factor = np.sqrt(np.max([np.maximum(np.diag(e), 0.0) for e in errors], axis=0)) / old
-    return np.asarray(white * np.outer(factor, factor))
 
 
 def _jackknife(candidate: Candidate, of: Callable[[Array], Array]) -> Array:

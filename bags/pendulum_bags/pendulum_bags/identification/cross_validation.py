@@ -107,7 +107,7 @@ def cross_validate(
         vectors.append(np.array(fitted.vector))
         total, loss, number = 0.0, 0.0, 0
         for piece in test:
-            mask = piece.mask()
+            mask = piece.mask
             error = simulate(fitted, piece, fit_states(fitted, piece)).theta[mask] - piece.recording.position[mask]
             total += float(error @ error)
             loss += robust_cost(error, scale)

@@ -16,8 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.identification.covariance import without
 from pendulum_bags.identification.model import BOUNDS, INDEX, from_plant
-from pendulum_bags.identification.problem import prepare, projected_sensitivities, simulate
+from pendulum_bags.identification.problem import prepare, simulate
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -209,7 +210,8 @@ def _windowed(problem: _Problem, effort: Array, theta: Array, omega: Array, free
     first = piece.windows[:, 0]
     piece = replace(piece, states=np.stack((theta[first], omega[first]), axis=1))
     result = simulate(from_plant(problem.plant), piece, free=free)
-    return np.concatenate(projected_sensitivities(result, piece.windows))
+    parts = [result.jacobian[first:stop] for first, stop in piece.windows]
+    return np.concatenate([without(part[:, -2:], part[:, :-2]) for part in parts])
 
 
 def _keeps(problem: _Problem, shape: Array) -> bool:

@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import student_quantile
 from pendulum_bags.identification.between_recordings import Alone, excluding, half_width
+from pendulum_bags.identification.covariance import Errors, standard_errors
 from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED, Explained
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.mechanism_choice import ALL_EXTRAS, choose
@@ -20,7 +21,6 @@ from pendulum_bags.identification.mechanism_doubt import better_reading, far_off
 from pendulum_bags.identification.mechanism_fit import (
     MOST,
     MechanismFit,
-    Prior,
     Windows,
     error_weights,
     first_weights,
@@ -251,12 +251,10 @@ class _Search:
 
         A search from far below the delay ends in a poor minimum.
         """
-        at, weights, costs = start.index([DELAY]), first_weights(data), dict[float, float]()
+        weights, costs = first_weights(data), dict[float, float]()
         models = dict[float, MechanismModel]()
         for delay in dict.fromkeys((start[DELAY], *_DELAYS)):
-            values = start.values.copy()
-            values[at] = delay
-            models[delay] = start.with_values(values)
+            models[delay] = start.with_changes({DELAY: delay})
             with suppress(DataError):
                 costs[delay] = fit(models[delay], data, (), weights, most=4, tolerance=1e-2).cost
         best = min(costs, key=costs.__getitem__, default=start[DELAY])
@@ -325,11 +323,9 @@ def _hold_undetermined(found: MechanismFit, weights: Array) -> tuple[MechanismFi
         if not open_ended:
             break
         worst = max(open_ended, key=lambda name: open_ended[name])
-        values = found.model.values.copy()
-        values[found.model.index([worst])] = start[worst]
         free = tuple(name for name in found.free if name != worst)
         try:
-            trial = found.again(weights, model=found.model.with_values(values), free=free)
+            trial = found.again(weights, model=found.model.with_changes({worst: start[worst]}), free=free)
         except DataError:
             break
         if trial.cost > 1.1 * found.cost:
@@ -345,68 +341,39 @@ def _uncertainty(found: MechanismFit, held: Sequence[str] = (), alone: Sequence[
     free = found.free
     errors = _errors(found)
     intervals = {}
-    for name, error, white in zip(free, errors.largest, errors.white, strict=True):
+    for name, error in errors.deviation.items():
         value = found.model[name]
-        half, deviation = half_width(name, alone, float(error), errors.freedom)
-        low = max(value - half, found.model.lowest(name))
-        intervals[name] = Interval(value, low, value + half, deviation, float(white))
-    spread = np.sqrt(np.diag(errors.inverse))
-    correlation = errors.inverse / np.outer(spread, spread)
-    condition = float(errors.level[-1] / max(float(errors.level[0]), 1e-300))
-    said = open_sentences(intervals, free, correlation, condition, errors.weakest, DELAY)
+        half, deviation = half_width(name, alone, error, _freedom(found))
+        low = max(value - half, found.model.bounds(name)[0])
+        intervals[name] = Interval(value, low, value + half, deviation, errors.white_deviation[name])
+    spread = np.sqrt(np.diag(errors.white))
+    correlation = errors.white / np.outer(spread, spread)
+    said = open_sentences(intervals, free, correlation, errors.condition, errors.singular, DELAY)
     largest = np.array([intervals[name].standard_error for name in free])
     return Uncertainty(
         intervals,
         free,
         correlation * np.outer(largest, largest),
         correlation,
-        condition,
-        float(np.max(largest / np.maximum(errors.white, 1e-300))),
+        errors.condition,
+        max(one.standard_error / max(one.white, 1e-300) for one in intervals.values()),
         "windows as clusters, recordings one by one",
         {},
         (*said, *held_sentences(found, held)),
     )
 
 
-@dataclass(frozen=True)
-class _Errors:
-    """Standard errors of a fit, shape (k,), their degrees of freedom, and the scaled normal matrix that they are of."""
-
-    largest: Array
-    white: Array
-    freedom: float
-    inverse: Array
-    level: Array
-    weakest: Array
-
-
-def _errors(found: MechanismFit) -> _Errors:
-    """Return the larger of two errors: white residuals, and windows as clusters (a sandwich), as these are coloured."""
-    free = found.free
-    matrix = np.diag(Prior.of(found.model, free).weights) + sum(b.matrices.sum(axis=0) for b in found.blocks)
-    # Each in its own error, were the others known: what the data hardly see is no rounding of what they see well.
-    size = np.array([found.model.size(name) for name in free])
-    own = np.diag(matrix)
-    size = np.where(own > 0.0, 1.0 / np.sqrt(np.where(own > 0.0, own, 1.0)), size)
-    prior = np.diag(Prior.of(found.model, free).weights * size**2)
-    matrix = matrix * np.outer(size, size)
-    level, axes = np.linalg.eigh(matrix)
-    # A direction that the data do not see has a wide interval, not none.
-    inverse = (axes / np.maximum(level, 1e-12 * max(float(level[-1]), 1e-300))) @ axes.T
-    scores_by_window = np.concatenate([b.gradients for b in found.blocks]) * size
-    samples, windows = sum(b.samples for b in found.blocks), len(scores_by_window)
-    fitted = found.states[0].shape[1] * windows + len(free) + found.offsets.size
-    white = found.cost / max(samples - fitted, 1) * np.diag(inverse)
-    spread = (scores_by_window.T @ scores_by_window) * windows / (windows - 1) + prior
-    clusters = np.diag(inverse @ spread @ inverse)
-    return _Errors(
-        np.sqrt(np.maximum(np.maximum(white, clusters), 0.0)) * size,
-        np.sqrt(np.maximum(white, 0.0)) * size,
-        float(max(windows - len(free), 3)),
-        inverse,
-        level,
-        axes[:, 0],
+def _errors(found: MechanismFit) -> Errors:
+    """Return the larger error of white residuals and of windows as clusters, as they are coloured."""
+    measured = sum(part.samples for part in found.data) * np.count_nonzero(found.weights)
+    fitted = sum(states.size for states in found.states) + len(found.free) + found.offsets.size
+    return standard_errors(
+        found.information, found.model, found.free, freedom=float(measured - fitted), serial=False, clusters=True
     )
+
+
+def _freedom(found: MechanismFit) -> float:
+    return float(max(sum(len(part.time) for part in found.data) - len(found.free), 3))
 
 
 def _alone(found: MechanismFit, weights: Array) -> list[Alone]:
@@ -418,12 +385,12 @@ def _alone(found: MechanismFit, weights: Array) -> list[Alone]:
             continue
         try:
             offsets = found.offsets[[i]]
-            one = found.again(weights, data=[part], states=[found.states[i]], offsets=offsets, tolerance=1e-5)
+            one = found.again(weights, data=[part], states=[found.states[i]], offsets=offsets, tolerance=1e-7)
         except (DataError, np.linalg.LinAlgError):
             continue
         errors = _errors(one)
         # The error of few windows is itself uncertain.
-        factor = float(student_quantile(0.975, errors.freedom) / student_quantile(0.975, 1e6))
-        deviation = dict(zip(one.free, (factor * errors.largest).tolist(), strict=True))
+        factor = float(student_quantile(0.975, _freedom(one)) / student_quantile(0.975, 1e6))
+        deviation = {n: factor * error for n, error in errors.deviation.items()}
         rows.append(Alone(name, {n: one.model[n] for n in one.free}, deviation))
     return rows

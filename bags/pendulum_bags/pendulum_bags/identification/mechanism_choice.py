@@ -106,7 +106,6 @@ def _held_out_error(found: MechanismFit, data: Sequence[Windows], weights: Array
 
     The parameters without a fold are one Gauss-Newton step from those of all data, where their gradient is known.
     """
-    index = found.model.index(found.free)
     size = np.array([found.model.size(name) for name in found.free])
     if len(data) > 1:
         folds = [
@@ -115,29 +114,20 @@ def _held_out_error(found: MechanismFit, data: Sequence[Windows], weights: Array
         ]
     else:
         folds = [[part] for part in np.array_split(np.arange(len(data[0].time)), 3)]
-    cost, samples = 0.0, 0
+    cost, samples, seen = 0.0, 0, found.information
     for fold in folds:
-        matrix, gradient = np.zeros((len(index), len(index))), np.zeros(len(index))
-        for blocks, out in zip(found.blocks, fold, strict=True):
-            stays = np.ones(len(blocks.gradients), dtype=bool)
-            stays[out] = False
-            matrix += blocks.matrices[stays].sum(axis=0)
-            gradient += blocks.gradients[stays].sum(axis=0)
-        values = found.model.values.copy()
-        values[index] -= size * (np.linalg.pinv(matrix * np.outer(size, size), rcond=1e-10) @ (size * gradient))
-        values[index] = np.maximum(values[index], [found.model.lowest(name) for name in found.free])
+        matrix, gradient = np.zeros((len(size), len(size))), np.zeros(len(size))
+        for parts, errors, out in zip(seen.projected, seen.residual, fold, strict=True):
+            for i in np.setdiff1d(np.arange(len(parts)), out):
+                matrix += parts[i].T @ parts[i]
+                gradient += parts[i].T @ errors[i]
+        step = size * (np.linalg.pinv(matrix * np.outer(size, size), rcond=1e-10) @ (size * gradient))
+        moved = {n: max(found.model[n] - d, found.model.bounds(n)[0]) for n, d in zip(found.free, step, strict=True)}
+        model = found.model.with_changes(moved)
         for part, states, out in zip(data, found.states, fold, strict=True):
             if not out.size:
                 continue
-            one = fit(
-                found.model.with_values(values),
-                [part.subset(out)],
-                (),
-                weights,
-                states=[states[out]],
-                most=8,
-                tolerance=1e-3,
-            )
+            one = fit(model, [part.subset(out)], (), weights, states=[states[out]], most=8, tolerance=1e-3)
             cost += one.cost
-            samples += one.blocks[0].samples
+            samples += one.data[0].samples * np.count_nonzero(weights)
     return float(np.sqrt(cost / samples))

@@ -12,13 +12,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.identification.arrowhead import bounded_step
+from pendulum_bags.identification.arrowhead import Blocks, minimise
+from pendulum_bags.identification.covariance import Information, information
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.kernel import cumulative_input
 from pendulum_bags.identification.mechanism_kernel import lagged, motion_kernel
@@ -29,9 +31,7 @@ from pendulum_msgs_py.errors import DataError
 
 __all__ = [
     "MOST",
-    "Blocks",
     "MechanismFit",
-    "Prior",
     "Score",
     "Windows",
     "error_weights",
@@ -58,9 +58,6 @@ _FINE = 0.0005
 
 MOST = 100
 """Most steps of a search; one that has not ended by then is no result."""
-
-_STUCK, _PROGRESS = 10, 0.99
-"""Steps over which a hopeless search has to take its cost below a share of what it was, or ends."""
 
 _NEAR = 5
 """Samples to each side from which the state at the start of a window is guessed."""
@@ -95,6 +92,11 @@ class Windows:
     velocity: Array | None
     states: Array
     area: Array
+
+    @property
+    def samples(self) -> int:
+        """Number of samples in the windows."""
+        return int(self.inside.sum())
 
     def subset(self, chosen: Sequence[int] | NDArray[np.int64]) -> Windows:
         """Return some of the windows."""
@@ -179,29 +181,6 @@ def _first_state(recording: JointRecording, first: int) -> Array:
 
 
 @dataclass(frozen=True)
-class Prior:
-    """Values of the plant file for the parameters of a fit, shape (k,), and one over their variances or 0."""
-
-    values: Array
-    weights: Array
-
-    @classmethod
-    def of(cls, model: MechanismModel, free: Sequence[str]) -> Prior:
-        """Return that of some parameters."""
-        start = MechanismModel.of(model.plant)
-        weights = np.array([model.spread(name) for name in free]) ** -2.0
-        return cls(np.array([start[name] for name in free]), weights)
-
-    def cost(self, values: Array) -> float:
-        """Return what it adds to the sum of squares."""
-        return float(self.weights @ (values - self.values) ** 2)
-
-    def gradient(self, values: Array) -> Array:
-        """Return half of the derivative of the cost."""
-        return np.asarray(self.weights * (values - self.values))
-
-
-@dataclass(frozen=True)
 class Score:
     """How well a recording is predicted, the start of each window fitted.
 
@@ -244,21 +223,6 @@ def noise_of(position: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Blocks:
-    """Normal equations of one recording with the start states eliminated.
-
-    Attributes:
-        matrices: By window, shape (w, k, k).
-        gradients: By window, shape (w, k).
-        samples: Positions inside the windows.
-    """
-
-    matrices: Array
-    gradients: Array
-    samples: int
-
-
-@dataclass(frozen=True)
 class MechanismFit:
     """A fit.
 
@@ -266,12 +230,10 @@ class MechanismFit:
         model: Parameters at the minimum.
         free: Names of what was fitted.
         states: Start states by recording, shape (w, 2 n).
-        cost: Weighted sum of squares.
-        blocks: Normal equations by recording, at the minimum, without what each recording has of its own.
-        errors: Simulated minus measured by recording, positions before velocities, shape (w, l, 2 n), 0 in the padding
-            and where no velocity was measured.
+        cost: Weighted sum of squares, with that of what was known beforehand.
         converged: Whether the search ended at a minimum, before its most steps.
         data: The windows of each recording.
+        weights: Of the errors of positions and velocities, shape (2 n,).
         own: Names of what each recording has a value of its own of; the model has their mean.
         offsets: Those values, shape (recordings, m).
     """
@@ -280,10 +242,9 @@ class MechanismFit:
     free: tuple[str, ...]
     states: list[Array]
     cost: float
-    blocks: list[Blocks]
-    errors: list[Array]
     converged: bool
     data: Sequence[Windows]
+    weights: Array
     own: tuple[str, ...]
     offsets: Array
 
@@ -291,6 +252,26 @@ class MechanismFit:
         """Return the fit from here under other weights, and with other arguments of :func:`fit`."""
         start = {"model": self.model, "data": self.data, "free": self.free, "states": self.states}
         return fit(weights=weights, **{**start, "own": self.own, "offsets": self.offsets, **changes})
+
+    @property
+    def models(self) -> list[MechanismModel]:
+        """The model of each recording, with its own offsets."""
+        return [self.model.with_changes(dict(zip(self.own, row, strict=True))) for row in self.offsets]
+
+    @cached_property
+    def errors(self) -> list[Array]:
+        """Simulated minus measured by recording, positions before velocities, shape (w, l, 2 n).
+
+        0 in the padding and where no velocity was measured.
+        """
+        rows = zip(self.models, self.data, self.states, strict=True)
+        return [_errors(part, _motions(one, one.vector[None], part, x[None])[0]) for one, part, x in rows]
+
+    @cached_property
+    def information(self) -> Information:
+        """Sensitivities and errors by window, weighted."""
+        motions = [_Motion(part, self.weights) for part in self.data]
+        return information(self.models, motions, self.states, self.free, self.own)
 
     @property
     def residuals(self) -> list[Array]:
@@ -320,11 +301,11 @@ def _motions(model: MechanismModel, values: Array, data: Windows, states: Array)
     return path
 
 
-def _sensitivity(model: MechanismModel, free: Sequence[str], data: Windows, states: Array, path: Array) -> Array:
+def _sensitivity(model: MechanismModel, names: Sequence[str], data: Windows, states: Array, path: Array) -> Array:
     """Return those of a motion to parameters and start states, shape (w, l, 2 n, k + 2 n)."""
-    index, width = model.index(free), states.shape[1]
-    steps = np.array([*(_DIFFERENCE * model.size(name) for name in free), *[_DIFFERENCE] * width])
-    values = np.tile(model.values, (steps.size, 1))
+    index, width = model.index(names), states.shape[1]
+    steps = np.array([*(_DIFFERENCE * model.size(name) for name in names), *[_DIFFERENCE] * width])
+    values = np.tile(model.vector, (steps.size, 1))
     starts = np.tile(states, (steps.size, 1, 1))
     for c, step in enumerate(steps):
         if c < len(index):
@@ -333,6 +314,59 @@ def _sensitivity(model: MechanismModel, free: Sequence[str], data: Windows, stat
             starts[c, :, c - len(index)] += step
     found = (_motions(model, values, data, starts) - path) / steps[:, None, None, None]
     return np.moveaxis(found, 0, -1)
+
+
+def _errors(part: Windows, path: Array) -> Array:
+    n = part.position.shape[-1]
+    measured = np.concatenate((part.position, path[..., n:] if part.velocity is None else part.velocity), axis=-1)
+    errors: Array = (path - measured) * part.inside[..., None]
+    return errors
+
+
+@dataclass
+class _Motion:
+    """The weighted errors of one recording; sensitivities are differences from the motion simulated last."""
+
+    part: Windows
+    weights: Array
+    last: tuple[Array, Array, Array] | None = None
+
+    def _path(self, model: MechanismModel, states: Array) -> Array:
+        last = self.last
+        if last is None or not (np.array_equal(last[0], model.vector) and np.array_equal(last[1], states)):
+            path = _motions(model, model.vector[None], self.part, states[None])[0]
+            self.last = last = (model.vector, states, path)
+        return last[2]
+
+    def cost(self, model: MechanismModel, states: Array) -> float:
+        path = self._path(model, states)
+        return float(np.sum((_errors(self.part, path) * self.weights) ** 2)) if np.isfinite(path).all() else np.inf
+
+    def sensitivities(
+        self, model: MechanismModel, states: Array, names: Sequence[str]
+    ) -> tuple[list[Array], list[Array]]:
+        flat, errors = self._sensitivities(model, states, names)
+        return list(flat), list(errors)
+
+    def _sensitivities(self, model: MechanismModel, states: Array, names: Sequence[str]) -> tuple[Array, Array]:
+        """Return those of each window to parameters and states, shape (w, i, k + 2 n), and the errors, shape (w, i)."""
+        path, part = self._path(model, states), self.part
+        own = self.weights * np.repeat([1.0, float(part.velocity is not None)], part.position.shape[-1])
+        scaled = _sensitivity(model, names, part, states, path) * (part.inside[..., None] * own)[..., None]
+        flat, errors = scaled.reshape(len(path), -1, scaled.shape[-1]), _errors(part, path) * self.weights
+        return flat, errors.reshape(len(path), -1)
+
+    def linearise(self, model: MechanismModel, states: Array, names: Sequence[str]) -> tuple[float, Blocks]:
+        k, (w, x) = len(names), states.shape
+        blocks, cost = Blocks.zeros(k, w, x), self.cost(model, states)
+        if math.isfinite(cost):
+            flat, errors = self._sensitivities(model, states, names)
+            matrix, gradient = flat.transpose(0, 2, 1) @ flat, np.einsum("wia,wi->wa", flat, errors)
+            if not np.isfinite(matrix).all():
+                return np.inf, blocks
+            h_pp, g_p = matrix[:, :k, :k].sum(axis=0), gradient[:, :k].sum(axis=0)
+            blocks = Blocks(h_pp, matrix[:, :k, k:], matrix[:, k:, k:], g_p, gradient[:, k:])
+        return cost, blocks
 
 
 # Far along an unstable motion sensitivities overflow; what is not finite is refused.
@@ -350,7 +384,7 @@ def fit(
     tolerance: float = 1e-6,
     hopeless: float = np.inf,
 ) -> MechanismFit:
-    """Minimise the weighted squares of the position errors over free parameters and start states.
+    """Minimise the weighted squares of the errors over free parameters and start states.
 
     Args:
         model: Start.
@@ -364,172 +398,23 @@ def fit(
         tolerance: Relative decrease of the cost below which the fit ends.
         hopeless: Weighted rms error above which the fit ends as soon as it makes little progress: it is refused anyway.
     """
-    index, apart = model.index(free), model.index(own)
     count = len(model.plant.joints)
-    if weights.size == count:
-        weights = np.concatenate((weights, np.zeros(count)))
-    prior = Prior.of(model, free)
-    size = np.array([model.size(name) for name in (*free, *own)])
-    low = np.array([model.lowest(name) for name in free])
-    # One row for each recording: they differ in what is their own.
-    values = np.tile(model.values, (len(data), 1))
-    values[:, index] = np.maximum(values[:, index], low)
-    if offsets is not None:
-        values[:, apart] = offsets
-    x = [np.array(s) for s in (states or [part.states for part in data])]
-    damping, k, converged = 1e-4, len(index), True
-    cost, paths = _simulate(model, values, data, x, weights)
-    cost += prior.cost(values[0, index])
-    if not np.isfinite(cost):
-        raise DataError(_AWAY)
-    columns = (*free, *own)
-    normal, errors = _linearise(model, values, columns, data, x, paths, weights)
-    if not all(np.isfinite(matrix).all() for matrix in normal[0]):
-        raise DataError(_AWAY)
-    beyond, costs = hopeless**2 * sum(_measurements(part, weights) for part in data), [cost]
-    for _ in range(most):
-        if cost > beyond and len(costs) > _STUCK and cost > _PROGRESS * costs[-_STUCK - 1]:
-            converged = False
-            break
-        costs.append(cost)
-        step, shifts, starts = _step(normal, prior, values[0, index], size, low, damping)
-        trial = values.copy()
-        trial[:, index] = np.maximum(trial[:, index] + step, low)
-        trial[:, apart] += shifts
-        moved = [a + b for a, b in zip(x, starts, strict=True)]
-        new, paths = _simulate(model, trial, data, moved, weights)
-        new += prior.cost(trial[0, index])
-        if new < cost:
-            following = _linearise(model, trial, columns, data, moved, paths, weights)
-            if not all(np.isfinite(matrix).all() for matrix in following[0][0]):
-                # So far along an unstable motion the derivatives have no size: a smaller step.
-                damping *= 8.0
-                continue
-            done = (cost - new) < tolerance * cost
-            values, x, cost = trial, moved, new
-            damping = max(0.2 * damping, 1e-9)
-            normal, errors = following
-            if done:
-                break
-        else:
-            damping *= 8.0
-            if damping > 1e8:
-                break
-    else:
-        converged = False
-    blocks = []
-    for matrix, gradient, part in zip(*normal, data, strict=True):
-        both = len(columns)
-        solved = np.linalg.pinv(matrix[:, both:, both:], hermitian=True) @ matrix[:, both:, :both]
-        reduced = matrix[:, :both, :both] - matrix[:, :both, both:] @ solved
-        along = gradient[:, :both] - np.einsum("wxk,wx->wk", solved, gradient[:, both:])
-        if own:
-            # What follows from the recording's own offsets is no evidence on what all have in common.
-            total = reduced.sum(axis=0)
-            follow = np.vstack((np.eye(k), -np.linalg.pinv(total[k:, k:], hermitian=True) @ total[k:, :k]))
-            reduced, along = follow.T @ reduced @ follow, along @ follow
-        blocks.append(Blocks(reduced, along, _measurements(part, weights)))
-    best = model.with_values(values.mean(axis=0))
-    return MechanismFit(best, tuple(free), x, cost, blocks, errors, converged, data, tuple(own), values[:, apart])
-
-
-def _measurements(part: Windows, weights: Array) -> int:
-    return int(part.inside.sum()) * int(np.count_nonzero(weights))
-
-
-def _simulate(
-    model: MechanismModel, values: Array, data: Sequence[Windows], states: Sequence[Array], weights: Array
-) -> tuple[float, list[Array]]:
-    """Return the cost, inf where a motion leaves all bounds, and the motions of each recording."""
-    total, paths = 0.0, []
-    for part, own, x in zip(data, values, states, strict=True):
-        path = _motions(model, own[None], part, x[None])[0]
-        paths.append(path)
-        if not np.isfinite(path).all():
-            return np.inf, paths
-        total += float(np.sum((_errors(part, path) * weights) ** 2))
-    return total, paths
-
-
-def _errors(part: Windows, path: Array) -> Array:
-    n = part.position.shape[-1]
-    measured = np.concatenate((part.position, path[..., n:] if part.velocity is None else part.velocity), axis=-1)
-    errors: Array = (path - measured) * part.inside[..., None]
-    return errors
-
-
-def _linearise(
-    model: MechanismModel,
-    values: Array,
-    free: Sequence[str],
-    data: Sequence[Windows],
-    states: Sequence[Array],
-    paths: Sequence[Array],
-    weights: Array,
-) -> tuple[tuple[list[Array], list[Array]], list[Array]]:
-    """Return the normal equations about the motions, and their errors."""
-    matrices, gradients, errors = [], [], []
-    for row, part, x, path in zip(values, data, states, paths, strict=True):
-        plain = _errors(part, path)
-        own = weights * np.repeat([1.0, float(part.velocity is not None)], part.position.shape[-1])
-        scaled = _sensitivity(model.with_values(row), free, part, x, path) * (part.inside[..., None] * own)[..., None]
-        flat = scaled.reshape(len(path), -1, scaled.shape[-1])
-        matrices.append(flat.transpose(0, 2, 1) @ flat)
-        gradients.append(np.einsum("wia,wi->wa", flat, (plain * weights).reshape(len(path), -1)))
-        errors.append(plain)
-    return (matrices, gradients), errors
-
-
-def _step(
-    normal: tuple[list[Array], list[Array]], prior: Prior, values: Array, size: Array, low: Array, damping: float
-) -> tuple[Array, Array, list[Array]]:
-    """Return the damped step of parameters, own offsets and start states; what would leave its domain stops there."""
-    k, both = values.size, size.size
-    reduced, gradient, starts, offsets = np.diag(prior.weights), prior.gradient(values), [], []
-    for matrix, slope in zip(*normal, strict=True):
-        found = _eliminated(matrix, slope, both, damping)
-        starts.append(found)
-        across = matrix[:, :both, both:] @ found
-        # Of the own offsets with those of the parameters of this recording, its start states eliminated.
-        own = (matrix[:, :both, :both] - across[:, :, :both]).sum(axis=0)
-        down = slope[:, :both].sum(axis=0) - across[:, :, both].sum(axis=0)
-        # An offset that only moves the starts leaves rounding here, which is no information.
-        seen = np.einsum("wii->i", matrix[:, k:both, k:both])
-        found = _eliminated(own[None], down[None], k, damping, 1e-10 * seen)[0]
-        offsets.append(found)
-        reduced = reduced + own[:k, :k] - own[:k, k:] @ found[:, :k]
-        gradient = gradient + down[:k] - own[:k, k:] @ found[:, k]
-    step = np.zeros(k)
-    if k:
-        # In shares of the parameters' scales. The little that is added keeps what the data do not see where it is.
-        scale = size[:k]
-        system = reduced * np.outer(scale, scale)
-        diagonal = np.diag(system)
-        system += np.diag((damping + 1e-10) * diagonal + np.where(diagonal > 0.0, 0.0, 1.0))
-        step = scale * bounded_step(system, scale * gradient, values / scale, low / scale, np.inf)
-    shifts = np.array([-(found[:, k] + found[:, :k] @ step) for found in offsets])
-    return (
-        step,
-        shifts,
-        [
-            -(found[:, :, both] + found[:, :, :both] @ np.concatenate((step, shift)))
-            for found, shift in zip(starts, shifts, strict=True)
-        ],
+    weights = np.concatenate((weights, np.zeros(count))) if weights.size == count else weights
+    found = minimise(
+        model,
+        [_Motion(part, weights) for part in data],
+        states or [part.states for part in data],
+        free,
+        own=own,
+        offsets=offsets,
+        max_iterations=most,
+        tolerance=tolerance,
+        hopeless=hopeless**2 * sum(part.samples for part in data) * np.count_nonzero(weights),
     )
-
-
-def _eliminated(matrix: Array, gradient: Array, k: int, damping: float, least: Array | float = 0.0) -> Array:
-    """Return how what comes after the first k unknowns follows them, and their own step, shape (w, x, k + 1).
-
-    ``least`` is added to their information; what has none stays where it is.
-    """
-    inner = matrix[:, k:, k:].copy()
-    # What a wrong model's motion hardly shows must not stop the search.
-    diagonal = np.einsum("wii->wi", inner)
-    diagonal[:] = (1.0 + damping) * diagonal + 1e-12 * diagonal.max(axis=1, keepdims=True, initial=0.0) + least
-    diagonal[diagonal == 0.0] = 1.0
-    right = np.concatenate((matrix[:, k:, :k], gradient[:, k:, None]), axis=2)
-    return np.linalg.solve(inner, right)
+    if not math.isfinite(found.cost):
+        raise DataError(_AWAY)
+    rest = found.states, found.cost, found.converged, data, weights, tuple(own), found.own
+    return MechanismFit(found.model, tuple(free), *rest)
 
 
 def scores(
@@ -555,8 +440,7 @@ def window_length(model: MechanismModel, recordings: Sequence[JointRecording], l
     motion, and motion about an unstable equilibrium.
     """
     n, lengths = len(model.plant.joints), []
-    smooth = model.values.copy()
-    smooth[model.index([f"{joint}.coulomb_friction" for joint in model.plant.coordinates.names])] = 0.0
+    smooth = model.with_changes({f"{joint}.coulomb_friction": 0.0 for joint in model.plant.coordinates.names}).vector
     for recording in recordings:
         stride = max(1, round(_LONGEST / recording.period))
         time, q = recording.time[::stride], recording.position[::stride]

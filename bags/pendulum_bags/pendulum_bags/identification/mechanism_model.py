@@ -10,13 +10,14 @@ with u after a first-order lag, delay d and lag common to all motors, and F_i th
 from __future__ import annotations
 
 import cmath
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.identification.arrowhead import Prior
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pack_joints
 
@@ -46,11 +47,11 @@ class MechanismModel:
 
     Attributes:
         plant: The plant that names mechanism, joints and what is held.
-        values: Fit parameters, in the order of ``names``.
+        vector: Fit parameters, in the order of ``names``.
     """
 
     plant: PlantParameters
-    values: Array
+    vector: Array
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -73,11 +74,17 @@ class MechanismModel:
 
     def __getitem__(self, name: str) -> float:
         """Return a value by name."""
-        return float(self.values[self.names.index(name)])
+        return float(self.vector[self.names.index(name)])
 
-    def with_values(self, values: Array) -> MechanismModel:
-        """Return the model with other numbers."""
-        return MechanismModel(self.plant, np.array(values, dtype=float))
+    def with_vector(self, vector: Array) -> MechanismModel:
+        """Return the model with other values."""
+        return MechanismModel(self.plant, np.array(vector, dtype=float))
+
+    def with_changes(self, changes: Mapping[str, float]) -> MechanismModel:
+        """Return the model with some values changed."""
+        vector = self.vector.copy()
+        vector[self.index(list(changes))] = list(changes.values())
+        return self.with_vector(vector)
 
     def unit(self, name: str) -> str:
         """Return the unit of a parameter."""
@@ -90,12 +97,22 @@ class MechanismModel:
         own = self.plant.coordinates.joints[self.plant.coordinates.names.index(joint)]
         return {"damping": own.damping_unit, "angle_offset": own.unit}.get(key, own.effort_unit)
 
-    def lowest(self, name: str) -> float:
-        """Return the least value that a parameter may take."""
+    def bounds(self, name: str) -> tuple[float, float]:
+        """Return the domain of a parameter."""
         for spec in self.plant.mechanism.parameters:
             if spec.name == name:
-                return 0.02 * self.plant.value(name) if spec.exclusive_minimum else 0.0
-        return 0.0 if name.endswith(("damping", "coulomb_friction", LAG)) else -np.inf
+                return 0.02 * self.plant.value(name) if spec.exclusive_minimum else 0.0, np.inf
+        return 0.0 if name.endswith(("damping", "coulomb_friction", LAG)) else -np.inf, np.inf
+
+    def prior(self, names: Sequence[str]) -> Prior:
+        """Return what the plant file knows of some parameters."""
+        start = MechanismModel.of(self.plant)
+        known = np.array([start[name] for name in names])
+        return Prior(known, np.array([self.spread(name) for name in names]) ** -2.0)
+
+    def within_reach(self, _other: MechanismModel) -> bool:
+        """Return that a step may lead anywhere within bounds."""
+        return True
 
     def spread(self, name: str) -> float:
         """Return the standard deviation with which the plant file knows a parameter; inf where it does not count."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.identification.arrowhead import Prior
 from pendulum_bags.identification.kernel import PARAMETER_NAMES
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.friction_terms import FRICTION_TERMS
@@ -106,6 +107,7 @@ PLANT_FRICTION_MODELS = ("viscous", "coulomb", "stribeck", "load", "stribeck_loa
 """Those that a plant file can hold: its friction knows the load of gravity, not that of the drive."""
 
 _DEFAULTS: dict[str, float] = {"inertia": 1.0, "gravity": 1.0, "input_gain": 1.0, "stribeck_velocity": 0.2}
+_SIZES = {"transport_delay": 1e-2, "angle_offset": 1e-1, "stribeck_velocity": 1e-1}
 _DEFAULTS |= {name: default for name, (default, _) in _FURTHER.items()}
 
 
@@ -165,6 +167,26 @@ class FitModel:
     def with_vector(self, vector: Array) -> FitModel:
         """Return the model with other values."""
         return replace(self, values=dict(zip(PARAMETER_NAMES, vector.tolist(), strict=True)))
+
+    def index(self, names: Sequence[str]) -> list[int]:
+        """Return the places of some parameters in the vector."""
+        return [INDEX[name] for name in names]
+
+    def bounds(self, name: str) -> tuple[float, float]:
+        """Return the domain of a parameter."""
+        return BOUNDS[name]
+
+    def size(self, name: str) -> float:
+        """Return a scale of a parameter, in its unit."""
+        return _SIZES.get(name, 1.0)
+
+    def prior(self, names: Sequence[str]) -> Prior:
+        """Return that nothing is known beforehand."""
+        return Prior(np.zeros(len(names)), np.zeros(len(names)))
+
+    def within_reach(self, other: FitModel) -> bool:
+        """Return whether the inertia, which is never negative, changes fourfold at most."""
+        return 0.25 * self["inertia"] <= other["inertia"] <= 4.0 * self["inertia"]
 
 
 def from_plant(plant: PlantParameters) -> FitModel:

@@ -172,7 +172,7 @@ def _edge(name: str, fit: OutputErrorFit, intervals: Mapping[str, Interval]) -> 
 def _unresolved(dropped: str, intervals: Mapping[str, Interval], fit: OutputErrorFit) -> str:
     """Return what is known where a torque offset and an angle offset do the same to the motion."""
     model = fit.model
-    angles = np.concatenate([piece.recording.position[piece.mask()] for piece in fit.pieces])
+    angles = np.concatenate([piece.recording.position[piece.mask] for piece in fit.pieces])
     cosine = float(np.mean(np.cos(angles)))
     total = model["torque_offset"] + model["gravity"] * cosine * model["angle_offset"]
     kept = "angle_offset" if dropped == "torque_offset" else "torque_offset"

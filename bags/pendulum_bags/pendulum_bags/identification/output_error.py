@@ -289,7 +289,7 @@ def _fit_friction(
         begin.append((replace(start.model, values=values, friction=name), start.states))
     solutions = [solve(m, pieces, everything, states=s, scale=scale, tolerance=1e-7, coarse=COARSE) for m, s in begin]
     # Long steps may have found what short ones do not confirm: those decide, between finds and starts too.
-    solutions += [Solution(m, s, np.inf, converged=False, iterations=0) for m, s in begin[:contained]]
+    solutions += [replace(start, model=m, states=s) for m, s in begin[:contained]]
     insides = [_inside(s, pieces) for s in solutions]
     costs = [robust_cost(inside, scale) for inside in insides]
     number = int(np.argmin(np.nan_to_num(costs, nan=np.inf)))
@@ -305,7 +305,7 @@ def _fit_friction(
 def _inside(solution: Solution, pieces: Sequence[Piece]) -> Array:
     """Return the residuals of all windows, by the steps of an answer, shape (n,) [rad]."""
     parts = residuals(solution.model, pieces, solution.states)
-    return np.concatenate([part[piece.mask()] for part, piece in zip(parts, pieces, strict=True)])
+    return np.concatenate([part[piece.mask] for part, piece in zip(parts, pieces, strict=True)])
 
 
 def _is_friction(name: str) -> bool:

@@ -70,7 +70,7 @@ def align(
 
     best, name = min(map(search, offsets), key=lambda one: one[0].cost)
     count = effective_samples(by_window(residuals(found.model, pieces, found.states), pieces))
-    if best.own is None or not pay(found.cost, best.cost, count, len(pieces) - 1):
+    if not pay(found.cost, best.cost, count, len(pieces) - 1):
         return found, list(pieces), None
     zeros = OwnOffsets((name,), best.own - best.own.mean(axis=0))
     shifts = zeros.values[:, 0].tolist()
@@ -82,7 +82,7 @@ def align(
         each - np.array([value, 0.0]) * (name == "angle_offset")
         for each, value in zip(best.states, shifts, strict=True)
     ]
-    return replace(best, states=states, own=None), moved, zeros
+    return replace(best, states=states), moved, zeros
 
 
 def _moved(recording: Recording, name: str, value: float, model: FitModel) -> Recording:

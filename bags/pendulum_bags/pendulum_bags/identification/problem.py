@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,6 @@ __all__ = [
     "longest_step",
     "off_line",
     "prepare",
-    "projected_sensitivities",
     "sensor_noise",
     "simulate",
     "stretches_between_gaps",
@@ -59,6 +59,7 @@ class Piece:
         index = np.asarray(chosen, dtype=int)
         return Piece(self.recording, self.windows[index], self.states[index], self.integral, self.enabled)
 
+    @cached_property
     def mask(self) -> NDArray[np.bool_]:
         """Return which samples lie in a window, shape (n,)."""
         inside = np.zeros(self.recording.time.size, dtype=bool)
@@ -195,16 +196,6 @@ def _supply(recording: Recording) -> float:
 
 def _servo_gain(model: FitModel, recording: Recording) -> float:
     return model.duty_gain * float(recording.meta.get("kp", 1.0))
-
-
-def projected_sensitivities(result: Simulation, windows: NDArray[np.int64]) -> list[Array]:
-    """Return those to the parameters of each window, what its initial state can take over projected out, (n, k)."""
-    parts = []
-    for first, stop in windows:
-        sensitivity, state = np.split(result.jacobian[first:stop], [-2], axis=1)
-        basis, _ = np.linalg.qr(state)
-        parts.append(sensitivity - basis @ (basis.T @ sensitivity))
-    return parts
 
 
 def simulate(

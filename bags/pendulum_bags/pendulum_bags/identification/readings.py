@@ -243,7 +243,7 @@ def _is_static(found: Solution, pieces: Sequence[Piece]) -> bool:
         return False
     inertial = []
     for part, piece in zip(residuals(model, pieces, found.states), pieces, strict=True):
-        time, inside = piece.recording.time, piece.mask()
+        time, inside = piece.recording.time, piece.mask
         theta = np.where(inside, part, 0.0) + piece.recording.position
         inertial.append(model["inertia"] * np.gradient(np.gradient(theta, time), time)[inside])
     drive = np.concatenate([_drive(model, piece) for piece in pieces])
@@ -256,7 +256,7 @@ def _torque_of_angle(model: FitModel, pieces: Sequence[Piece]) -> bool:
     if model.input_kind not in {"effort", "voltage"}:
         return False
     u = np.concatenate([_drive(model, piece) for piece in pieces])
-    angle = np.concatenate([piece.recording.position[piece.mask()] for piece in pieces])
+    angle = np.concatenate([piece.recording.position[piece.mask] for piece in pieces])
     if np.std(u) <= 0.0:
         return False
     columns = np.stack((np.ones_like(angle), np.sin(angle), np.cos(angle), angle), axis=1)
@@ -266,4 +266,4 @@ def _torque_of_angle(model: FitModel, pieces: Sequence[Piece]) -> bool:
 
 def _drive(model: FitModel, piece: Piece) -> Array:
     recording = piece.recording
-    return model["input_gain"] * np.interp(recording.time, recording.input_stamps, recording.input)[piece.mask()]
+    return model["input_gain"] * np.interp(recording.time, recording.input_stamps, recording.input)[piece.mask]

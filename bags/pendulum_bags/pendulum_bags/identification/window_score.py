@@ -108,7 +108,7 @@ def _score(model: FitModel, piece: Piece, states: Array) -> WindowScore:
     recording = piece.recording
     error = result.theta - recording.position
     by_window = np.array([np.sqrt(np.mean(error[a:b] ** 2)) for a, b in piece.windows])
-    mask = piece.mask()
+    mask = piece.mask
     lengths = piece.windows[:, 1] - piece.windows[:, 0]
     ends = np.cumsum(lengths)
     inside = error[mask]

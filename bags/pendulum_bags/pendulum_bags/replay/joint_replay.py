@@ -120,12 +120,11 @@ def replay_joints(
     own = load_mechanism(plant) if isinstance(plant, str) else plant
     recording = read_joints(path, own.coordinates, mapping)
     recording.check(own.coordinates)
-    model = MechanismModel.of(own)
-    values = model.values.copy()
-    values[model.index([DELAY, LAG])] = common_delay(own), max((a.time_constant for a in own.actuators), default=0.0)
+    lag = max((actuator.time_constant for actuator in own.actuators), default=0.0)
+    model = MechanismModel.of(own).with_changes({DELAY: common_delay(own), LAG: lag})
     data = prepare_windows(recording, window)
     weights = 1.0 / np.maximum(line_errors(data), 1e-9)
-    found = fit(model.with_values(values), [data], (), weights, most=12, tolerance=1e-6)
+    found = fit(model, [data], (), weights, most=12, tolerance=1e-6)
     inside = data.inside
     measured = data.position[inside]
     return JointReplay(
