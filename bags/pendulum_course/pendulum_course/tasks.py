@@ -60,8 +60,6 @@ class Tasks:
         causes: Names in ``CAUSES``, in the order of a, b, c, d.
         controller_a: R of controller A [1/(N m)^2].
         controller_b: R of controller B [1/(N m)^2].
-        noise_seed: Seed of the noise under which A and B are compared.
-        fault: The fault that the bridge must report.
     """
 
     time_constant: float

@@ -48,13 +48,7 @@ class SwingUp:
     """N plants of n joints, m of them driven, under one policy.
 
     Args:
-        count: N.
         plant: The nominal plant; rigid, or of several joints.
-        ranges: Lowest and highest value of each varied parameter.
-        generator: Draws plants, starts, delays, noise and kicks.
-
-    Attributes:
-        progress: Finished share of the training, on which the cost of the travel depends.
 
     Raises:
         ParameterError: The plant is series elastic, has no motor, or a delay of its own.

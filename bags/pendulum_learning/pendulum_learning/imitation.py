@@ -36,8 +36,6 @@ class Imitation:
 
     Args:
         environment: The plants; episodes start along the teacher's swing-up.
-        settings: Widths of the network and the horizon.
-        generator: Draws first weights, starts, noise and the order of the data.
     """
 
     def __init__(

@@ -15,13 +15,7 @@ __all__ = ["Adam", "Mlp"]
 
 
 class Mlp:
-    """Dense layers with tanh between them and a linear last one.
-
-    Args:
-        sizes: Number of inputs, widths of the hidden layers, number of outputs.
-        generator: Draws the first weights.
-        last: Factor on the first weights of the last layer.
-    """
+    """Dense layers with tanh between them and a linear last one."""
 
     def __init__(self, sizes: Sequence[int], generator: np.random.Generator, last: float = 1.0) -> None:
         self.parameters: list[Floats] = []

@@ -33,9 +33,7 @@ class SwingUpTask:
         velocity_noise: Standard deviation of measured velocities [rad/s].
         offset: Largest error of the zero angle [rad], and of the torque as a share of the limit [-].
         kick: Largest torque on the link, as a share of the torque limit; a kick lasts 50 ms [-].
-        kick_rate: Kicks per second.
         rate_time: Least time for the torque to go from one limit to the other [s].
-        history: Samples that the policy sees.
         travel: Largest deviation of a joint that slides [m].
         episode: Length of an episode [s].
     """

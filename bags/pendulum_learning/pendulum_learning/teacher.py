@@ -39,7 +39,6 @@ class Teacher:
     Attributes:
         states: Its nodes, deviations from upright and velocities, shape (K, 2n).
         efforts: At the nodes, shape (K, m) [N m or N].
-        moving: Number of nodes before the upright LQR's region.
 
     Raises:
         ParameterError: No swing-up is stored for the plant.

@@ -120,12 +120,6 @@ def train(
 ) -> tuple[Policy, NDArray[np.float64]]:
     """Train, or resume from a checkpoint, and write the policy file.
 
-    Args:
-        settings: Settings of the training.
-        out: The policy file.
-        on_update: Called with the number of finished updates and their measurements.
-        on_trial: Called with the number of finished and of all trials, after the last update.
-
     Returns:
         The policy, and its curves: steps, mean reward, divergence and spread per update, shape (n, 4).
 

@@ -46,9 +46,6 @@ class Piece:
     """One recording, or one run folder with the bags ``sim`` and ``hw``.
 
     Attributes:
-        name: Its path below the folder that was given.
-        path: Absolute path.
-        is_run: Whether it is a run folder.
         how: How a recording is read that is no bag of ours: mapping, topics, time between rows, beginning and end.
     """
 
@@ -94,9 +91,6 @@ class Table:
     """The results.
 
     Attributes:
-        bags: A row for each plant of each bag, in the order of their names.
-        runs: A row for each run folder.
-        kept: How many pieces an earlier call had finished.
         wall: Time that this call took [s].
     """
 
@@ -117,9 +111,7 @@ def find_pieces(folders: Sequence[Path], questions: Sequence[str], how: Reading 
     Recordings of other formats are taken where a folder has no bag, or where they are given themselves.
 
     Args:
-        folders: Folders, bags and other recordings.
         questions: Names of ``QUESTIONS``.
-        how: How recordings are read that are no bags of ours.
 
     Raises:
         BagError: A folder does not exist, or there is no bag in any of them.
@@ -172,11 +164,9 @@ def analyse_bags(
 
     Args:
         folder: Where results and tables go; with results of some pieces, it is continued.
-        pieces: The bags and run folders.
         questions: Names of ``QUESTIONS``.
         connect: To a Dask cluster (`cluster_client`) that sees the bags under the same paths; by default the pieces
             run one after the other in this process.
-        on_progress: Called with pieces done and in all.
     """
     began = time.monotonic()
     answers = folder / "answers"

@@ -119,10 +119,7 @@ def settings_of(context: typer.Context, kind: type[Study], one_only: Collection[
     Of a plant of several joints those count that were typed: the defaults of the options are those of one joint.
 
     Args:
-        context: Of the command.
         kind: Of the study; its options have the names of its settings.
-        one_only: Further options that plants of several joints do not have.
-        **others: Settings whose options have another form.
 
     Raises:
         ParameterError: An option was typed that is not for this plant.

@@ -123,13 +123,7 @@ def strategies(
 
 
 def _shipped(name: str, what: str, example: str) -> Callable[..., None]:
-    """Return the command of a shipped study.
-
-    Args:
-        name: Of the study.
-        what: Its help, in a sentence.
-        example: How it is called, behind its name.
-    """
+    """Return the command of a shipped study."""
 
     def command(
         out: Out = None,

@@ -105,10 +105,6 @@ def run_whole(
 
     Args:
         out: Folder of the run, or None.
-        experiment: Its name.
-        order_in: Returns what is wanted, in the run's folder.
-        json_output: Print JSON alone on standard output.
-        remark: Returns a sentence for the end, in the run's folder.
 
     Raises:
         typer.Exit: The user interrupted it.

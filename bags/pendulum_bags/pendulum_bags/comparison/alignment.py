@@ -22,11 +22,8 @@ class Alignment:
 
     Args:
         delay: By how much the second lags the first; negative where it leads [s].
-        correlation: Correlation at that delay.
-        correlation_at_zero: Correlation as recorded, nothing moved.
         lags: Lags tried, shape (n,) [s].
         curve: Correlation at each, shape (n,).
-        of: What was correlated.
     """
 
     delay: float
@@ -97,8 +94,6 @@ def align_signals(first: Signal, second: Signal, period: float) -> Alignment:
     """Estimate how much the second signal lags the first; both are held from sample to sample.
 
     Args:
-        first: Signal.
-        second: Signal.
         period: Resolution of the lags [s].
     """
     start, stop = max(first.t[0], second.t[0]), min(first.t[-1], second.t[-1])

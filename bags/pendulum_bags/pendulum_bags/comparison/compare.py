@@ -45,19 +45,11 @@ class Comparison:
     """The result of comparing simulation and hardware, of one run or several.
 
     Args:
-        pairs: Simulation and hardware of each run.
         own: Simulations under the thesis's own protocol (noise of their own); those of the pairs where there are none.
-        thesis: The thesis's difference for the first run.
         verdict: Verdict on the paired comparison, or on the unpaired one where the disturbances differ.
-        unpaired_verdict: Verdict on the unpaired comparison.
         tested: The runs that the verdicts rest on; the others are shown.
-        looks: Number of interim analyses so far.
-        left_out: What was recorded and is excluded, and why, as text.
-        unproved: What could be checked of a plant only in part, as text.
-        stalls: Run folder, reason and logs of each run that a stalled machine aborted before the one that counts.
         shared: What brought both to one clock: ``disturbance``, or of files ``reference``, ``input`` or ``motion``.
         advice: What to do next where files do not allow a verdict; empty for what the tests say.
-        operating: Operating band of repeated runs of a machine.
     """
 
     pairs: Sequence[Pair]
@@ -234,7 +226,6 @@ def compare(
 
     Args:
         pairs: (simulation, hardware) of each run, at least one.
-        own: Simulations under the thesis's own protocol.
         margin: What difference does not matter; see :meth:`Margins.parse`.
         looks: Number of interim analyses, where data are added until they decide.
         shown: Runs, by their place among the pairs, that are shown and not tested; some other run is tested.
@@ -292,10 +283,7 @@ def compare_joints(
     """Compare run folders, joint by joint, as :func:`compare_folders` does.
 
     Args:
-        folders: Run folders.
         joints: Joints of plants of several; one empty name for plants of one.
-        margin: What difference does not matter.
-        looks: Number of interim analyses.
     """
     with CachedBags() as bags:
         more: dict[str, Any] = {"margin": margin, "looks": looks, **({"open_bag": bags} if any(joints) else {})}
@@ -316,11 +304,8 @@ def compare_folders(
     phase of their own in each run, which one run does not show. One that a busy machine disturbed is left out.
 
     Args:
-        folders: Run folders.
         margin: What difference does not matter; see :meth:`Margins.parse`.
         looks: Number of interim analyses; by default that of the folders.
-        joint: Joint of plants of several.
-        open_bag: How bags are opened.
 
     Raises:
         BagError: A folder lacks one of its bags.

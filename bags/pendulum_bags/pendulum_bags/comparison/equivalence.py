@@ -38,15 +38,10 @@ class EquivalenceTest:
     """One quantity against its margin.
 
     Args:
-        quantity: What was tested, as text.
-        unit: Unit of the figures.
         interval: Estimate with its interval; one of 90 % is two one-sided tests at 5 % each.
         low: Lower margin; minus infinity for a one-sided test.
-        high: Upper margin.
-        outcome: What it shows.
         more_runs: Runs to record in addition for a decision with 80 % probability; 0 where decided, None where more
             runs would hardly help, since the estimate sits on the margin.
-        smallest_margin: Smallest margin at which it would be equivalent.
     """
 
     quantity: str
@@ -117,14 +112,8 @@ def equivalence_test(
     """Test one quantity.
 
     Args:
-        quantity: Name as text.
-        unit: Unit.
-        interval: Estimate and interval.
         low: Lower margin; minus infinity for one-sided.
-        high: Upper margin.
         outside: Interval that shows a difference where it lies beyond a margin; by default the same.
-        runs: Runs that the interval rests on.
-        ratio: Whether it is a ratio, whose distances are logarithms.
     """
     scale = _logarithm if ratio else float
     estimate, left, right = (scale(value) for value in (interval.estimate, interval.low, interval.high))
@@ -195,9 +184,6 @@ class Verdict:
 
     Args:
         outcome: Equivalent if all are, not equivalent if one is not, undecided otherwise.
-        sentence: The verdict as text.
-        tests: The tests.
-        margins: The margins.
         more_runs: Runs to record in addition for a decision; 0 where decided, None where more hardly help.
     """
 
@@ -223,9 +209,6 @@ def conclude(tests: Sequence[EquivalenceTest], margins: Margins, first: str, sec
 
     Args:
         tests: At least one.
-        margins: Margins of the tests.
-        first: Name of the one plant.
-        second: Name of the other.
     """
     by_outcome = {outcome: [test for test in tests if test.outcome is outcome] for outcome in Outcome}
     different, undecided = by_outcome[Outcome.DIFFERENT], by_outcome[Outcome.UNDECIDED]

@@ -110,10 +110,8 @@ def moments(clock: SlowClock, motions: Array, disturbance: Disturbance | None, b
     """Return the sums of products of one run.
 
     Args:
-        clock: Its times.
         motions: Band-limited, at the even times of the clock, shape (n, m).
         disturbance: Its noise, on the same time axis; None where none is known.
-        blocks: Into how many blocks of equal length it is divided.
     """
     size = len(motions)
     modes, gram, squares = np.empty((size, 0)), np.empty((0, 0)), np.zeros(size)
@@ -211,7 +209,6 @@ def covariance(products: Array, sizes: Array, noise: Array, moment: Moments) -> 
         products: Sums of products over samples, shape (..., q, q).
         sizes: Number of samples, shape (...).
         noise: Sums of squares of the noise over them, shape (...).
-        moment: Of the run, for what does not depend on the samples.
     """
     p = len(moment.gram)
     means = products / sizes[..., None, None]

@@ -84,13 +84,8 @@ class Margins:
     """How much difference does not matter; a margin that is not given is that of ``margins.yaml`` of the package.
 
     Args:
-        mean_angle: Difference of the mean angles.
         spread_angle, spread_velocity, spread_torque: Difference of the standard deviations: in a unit, or as a share,
             which allows factors from 1 / (1 + share) to 1 + share.
-        delay: Delay of one plant's response to the disturbance relative to the other's.
-        path_angle, path_velocity: Root mean square distance of the motions under one disturbance.
-        band: Frequency up to which velocities, torques and paths are compared.
-        mean_position: Difference of the mean positions of a joint that slides.
         stated: Names of the margins that the user stated; the others are defaults, and the verdict reports it.
     """
 

@@ -24,7 +24,6 @@ class Band:
     Prediction intervals by Student's t of the runs, at each time by itself.
 
     Attributes:
-        coverage: Share of the time in which the simulation is inside.
         own: Mean of that share for each run of the machine, in the band of the others; NaN for fewer than three runs.
     """
 

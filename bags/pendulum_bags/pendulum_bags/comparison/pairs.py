@@ -33,8 +33,6 @@ class Difference:
         t: Shape (n,) [s].
         position: Shape (n,) [rad].
         velocity: Shape (n,) [rad/s].
-        simulation: The simulation at those times.
-        hardware: The hardware at those times.
     """
 
     t: Array
@@ -52,8 +50,6 @@ def interpolated_difference(simulation: Series, hardware: Series, *, at: str = "
     """Return the difference, with one motion interpolated by cubic splines at the other's stamps.
 
     Args:
-        simulation: Simulated motion.
-        hardware: Measured motion.
         at: ``simulation`` takes the simulation's stamps, as the thesis does; ``slower`` those of the motion with
             fewer samples, so that no sample is counted that was never measured.
     """
@@ -91,11 +87,6 @@ class Pair:
     @classmethod
     def of(cls, simulation: RunData, hardware: RunData, *, on_one_clock: bool = False) -> Pair:
         """Compare two runs.
-
-        Args:
-            simulation: The simulation.
-            hardware: The hardware.
-            on_one_clock: Whether a signal that both have brought them to one clock already.
 
         Raises:
             DataError: A plant did not move, one of several joints fell, or the runs have too little in common.

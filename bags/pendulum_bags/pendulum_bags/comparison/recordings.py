@@ -69,7 +69,6 @@ class Shared:
     Attributes:
         kind: ``disturbance``, ``reference``, ``input`` or ``motion``; empty for nothing.
         shift: By how much the second has to be moved to later [s].
-        correlation: Of the two, there.
         why: Why it is no more, as text; empty where it is a signal.
         signals: The signal of each, on the clock of the first; of joints without one, too.
     """
@@ -98,12 +97,8 @@ def compare_runs(
         simulation: Recording of the simulation: a bag, or any other as a ``Reading``.
         hardware: Recording of the hardware; several of a run that was repeated.
         sim_prefix: Namespace of the simulation's topics; None for that of the bag's only plant.
-        hw_prefix: Namespace of the hardware's topics.
-        own_protocol: Bag of a simulation with noise of its own, for the thesis's analysis.
         margin: What difference does not matter; see :meth:`Margins.parse`.
-        joint: Joint of plants of several.
         joints: All joints, and their names in the hardware's recordings where those have others.
-        open_bag: How bags are opened.
 
     Raises:
         BagError: A bag cannot be read.
@@ -140,7 +135,6 @@ def compare_recordings(
     """Compare a simulation with one run of a machine, or with some that were repeated.
 
     Args:
-        simulation: All of it, or the part that was chosen.
         hardware: At least one run.
         shared: What each has in common with the simulation; None to find it.
         margins: What difference does not matter; None for the defaults.
@@ -226,12 +220,7 @@ _ADVICE = {
 
 
 def find_shared(simulation: Sequence[RunData], hardware: Sequence[RunData]) -> Shared:
-    """Return what two recordings have in common, and by how much the second has to be moved for it.
-
-    Args:
-        simulation: Its joints.
-        hardware: The same joints, in the same order.
-    """
+    """Return what two recordings have in common, and by how much the second has to be moved for it."""
     reasons = []
     joints = list(zip(simulation, hardware, strict=True))
     for kind, signal in _SIGNALS.items():

@@ -106,11 +106,7 @@ class _Kind:
     """What all tests of some motions have in common.
 
     Args:
-        looks: Number of interim analyses.
-        runs: Runs that the intervals rest on.
-        slides: Whether the motions are those of a joint that slides.
         driven: Whether any of them had a controller's torque: 0 and 0 are no test.
-        runs_differ: Whether runs may differ by more than their seeds.
     """
 
     looks: Looks
@@ -162,11 +158,7 @@ def paired_tests(
     """Test all pairs together.
 
     Args:
-        pairs: Simulation and hardware of each run under one disturbance, on one clock.
-        margins: The margins.
         noises: The disturbance of each run on that clock, where it is white and known.
-        looks: Number of interim analyses of these data.
-        runs_differ: Whether runs may differ by more than their seeds.
     """
     band = min(common_band(margins.band.si, *pair) for pair in pairs)
     seen = [_Seen(*pair, band) for pair in pairs]
@@ -205,12 +197,7 @@ def unpaired_tests(
     """Test means and spreads of runs that share no disturbance, simulation and hardware each by itself.
 
     Args:
-        simulations: Motions of the simulation.
-        hardware: Motions of the hardware.
-        margins: The margins.
         noises: The disturbances of both, each on its motion's clock, where they are white and known.
-        looks: Number of interim analyses of these data.
-        runs_differ: Whether runs may differ by more than their seeds.
     """
     band = common_band(margins.band.si, *simulations, *hardware)
     period = max(one.period for one in (*simulations, *hardware))
@@ -290,7 +277,6 @@ class _Run:
         sizes: Samples of each of these, shape (1 + g,).
         near: Covariance and mean within the window, with the delay as it is and as it might be too, shape (k, m, m)
             and (k, m).
-        short: Largest correction for the window's own mean, as a share of a spread.
     """
 
     spread: Array

@@ -27,11 +27,8 @@ class SharedSignal:
     """Two recorded disturbances compared.
 
     Args:
-        alignment: Their cross-correlation.
-        amplitude: Root mean square of the second per that of the first.
         threshold: Correlation from which they count as one: independent signals that change as seldom exceed it with a
             probability of ``CHANCE``.
-        changes: How often the one that changes less often takes a new value.
     """
 
     alignment: Alignment
@@ -70,8 +67,6 @@ def compare_signals(first: Signal | None, second: Signal | None, period: float) 
     """Compare two recorded disturbances as functions of time since their start; None where one is missing.
 
     Args:
-        first: The simulation's.
-        second: The hardware's.
         period: Resolution of the lags [s].
     """
     if first is None or second is None or min(first.t.size, second.t.size) < 12:

@@ -47,8 +47,6 @@ def spectra_of(first: Series, second: Series, segment: float = 1.0) -> Spectra:
     coherence needs common samples: the faster motion is brought to the slower rate behind an anti-alias filter.
 
     Args:
-        first: Motion.
-        second: Motion.
         segment: Length of a segment, halves overlapping [s]; shortened where fewer than four would fit.
     """
     start, stop = shared_span(first, second)

@@ -49,16 +49,7 @@ def rms(values: Array) -> float:
 
 
 class Interval(NamedTuple):
-    """An estimate with its interval.
-
-    Attributes:
-        estimate: From all data.
-        low: Lower end.
-        high: Upper end.
-        level: Probability that the interval is meant to have.
-        error: Standard error.
-        blocks: Independent pieces that the interval rests on.
-    """
+    """An estimate with its interval."""
 
     estimate: float
     low: float
@@ -82,10 +73,6 @@ class Jackknife:
     """An estimate with its standard error, from estimates that each lack one part of the data.
 
     Attributes:
-        estimate: From all data.
-        error: Standard error.
-        freedom: Degrees of freedom of the error.
-        blocks: Parts.
         between: The same estimate with the error that the runs show; None where they differ by chance alone.
     """
 
@@ -103,7 +90,6 @@ class Jackknife:
         few blocks is estimated too low by (1 + 4 rho) / g (Marriott, Pope, Biometrika 41, 1954), here for rho = 1/4.
 
         Args:
-            estimate: From all data.
             without: Estimates that each lack one block, in the order of time, shape (g,), g >= 2.
         """
         blocks = len(without)
@@ -140,9 +126,7 @@ class Jackknife:
         """Return the interval by Student's t.
 
         Args:
-            level: Probability.
             scale: Maps the estimate and the ends to the quantity reported, such as ``math.exp`` for a logarithm.
-            beside: Error that is no matter of chance, added to both sides.
         """
         reach = float(student_quantile(0.5 + 0.5 * level, self.freedom)) * self.error
         if self.between:

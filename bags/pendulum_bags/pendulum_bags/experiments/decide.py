@@ -36,13 +36,9 @@ def decide(
 
     Args:
         folder: Folder of the run, recorded; a repeat whose hardware recording exists already is used at once.
-        settings: Settings of the run.
-        margins: Differences that do not matter.
         deadline: Of the repeats; None for one analysis of the existing recordings.
         joints: Joints of plants of several; else one without a name.
         on_repeat: Called with the number of a repeat and its duration of noise [s] before it is recorded.
-        on_comparison: Called with the comparison of each joint after each analysis.
-        record: Records the missing parts of a repeat, or raises BudgetSpentError.
     """
     if not settings.can_repeat or deadline is None:
         compared = compare_joints([folder], joints, margin=margins)

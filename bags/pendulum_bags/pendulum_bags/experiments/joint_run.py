@@ -56,8 +56,6 @@ class JointSettings:
     """Noise on one joint of a plant that a controller holds upright, in simulation and on an emulated machine.
 
     Attributes:
-        plant: Preset or file of the simulated plant.
-        machine: Plant file of the emulated machine.
         design: Preset or file that the controller is designed on; empty for the simulated plant.
         joint: Driven joint that has the noise; empty for the first.
         noise: The disturbance, such as one of :func:`default_amplitude`.

@@ -51,11 +51,9 @@ class Orchestrator:
 
     Args:
         watch: Called between two slices of waiting; raises to end the experiment (a process has died).
-        on_wait: Called between two slices, to show progress.
 
     Attributes:
         listened: Total time of spinning [s], without pauses of this program.
-        after_listening: Called after each slice of spinning, for occasional checks.
     """
 
     def __init__(
@@ -139,7 +137,6 @@ class PlantClient:
 
     Args:
         namespace: Namespace of the plant's topics, such as ``/sim``.
-        plant: Name of the plant's node.
         controller: Name of its controller's node, empty for none.
         disturbance: Name of its disturbance's node, empty for none.
         watch: Subscribe to its states now; a plant in lockstep waits for its last listener, which may be this one.

@@ -76,8 +76,6 @@ class ProcessSet:
     """The programs of one run; leaving the context ends them all.
 
     Args:
-        log_folder: Folder of one log file per program.
-        environment: Variables to add, such as the ROS domain.
         hosts: Processes that run programs one after the other; without them each has its own.
     """
 
@@ -120,13 +118,9 @@ class ProcessSet:
         If there are hosts and the command is a program of this project, one of them runs it.
 
         Args:
-            name: For messages and the log file.
-            command: Program and arguments.
             ends_last: End it after all others: a recorder records their last messages.
             ends_by_itself: It is expected to end with code 0.
             niceness: Scheduling priority to give away, or to take if negative and permitted.
-            environment: Variables to add for this one.
-            alone: Give it a process of its own, even with hosts.
         """
         log = self.log_folder / f"{name}.log"
         everything = {**os.environ, **self.environment, **(environment or {})}

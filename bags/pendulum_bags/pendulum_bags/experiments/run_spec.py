@@ -68,16 +68,12 @@ class RunSpec:
 
     Attributes:
         side: ``sim`` for the simulator, ``hw`` for the emulated hardware.
-        plant: Preset or file of the simulated plant, or of the emulated machine.
-        design_plant: Preset or file that the controller is designed on.
         strategy: The actuator's conversion of torque into PWM (``hw``).
         disturbance: Parameters of the disturbance; empty for none.
         theta: Initial angle; plants of several joints begin upright [rad].
         set_point: Angle to hold, from upright [rad].
         duration: Length [s].
-        seed: Seed of the disturbance, and of the sensors of the emulated hardware.
         method: Integrator of the simulator; Euler as in the thesis, but not for a plant with motor and spring.
-        plant_parameters: Further parameters of the plant's node, such as sensor noise.
         clock: ``lockstep`` for as fast as the nodes reply, ``realtime`` for wall time.
         simulation: A third-party simulation in place of ``plant``, a model file or ``gymnasium:ID``; empty for none.
         mapping: Its mapping file; empty for none.

@@ -89,14 +89,12 @@ class RegulationSettings:
     """Regulation of the upright pendulum under noise, on simulator and hardware, as in the thesis.
 
     Attributes:
-        plant: Preset or file of the simulated plant.
         design: Preset or file that the controller is designed on; empty for the simulated plant.
         hardware: ``emulator``, ``hebi`` for the machine of a lab file, a second third-party simulation (a model file or
             ``gymnasium:ID``), or ``ros:/namespace`` for a plant that runs already.
         lab: The lab file, for ``hebi``.
         effort_strategy: The actuator's conversion of torque into PWM, which changes the plant. Empty for that of the
             lab file, else ``direct_pwm``; read it from :attr:`strategy`.
-        controller: Kind of controller, or a policy file (.npz).
         method: Integrator of the simulator; Euler as in the thesis, but not for a plant with motor and spring.
         simulation: A third-party simulation: a model file, ``gymnasium:ID``, or ``ros:/namespace`` for one that runs
             already; empty for the simulator.

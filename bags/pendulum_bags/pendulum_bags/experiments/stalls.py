@@ -37,10 +37,8 @@ def run_undisturbed(run: Callable[[], None], folder: Path, *, emulated: bool, te
     """Carry out a run, and repeat it if the machine stalled.
 
     Args:
-        run: Records into the folder.
         folder: The run's folder; logs and reason of a stalled run remain, for the result.
         emulated: Whether the hardware is emulated; a real machine moves only on its operator's command.
-        tell: Called with a sentence on each stall.
 
     Raises:
         FaultError: It failed for another reason, or the machine stalled each time.

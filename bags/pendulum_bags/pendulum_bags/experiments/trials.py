@@ -66,7 +66,6 @@ class TrialSettings:
         hardware: ``emulator`` or ``hebi``.
         plant: Plant of the emulator: preset or file with a drivetrain.
         realtime: Wall time for the emulator too; a real actuator always has it.
-        seed: Seed of the simulated hand, and of sensor noise.
         step: Height of a step of the staircase [deg].
         top: Highest angle of the staircase [deg].
         hold: Time at rest on each step [s].

@@ -94,11 +94,9 @@ class Panel:
     """One pair of axes.
 
     Args:
-        x_label, y_label: With units.
         title: Above the axes; empty for none.
         x_range, y_range: Limits; None to fit the data.
         y_ticks: Names at 0, 1, 2, ...; empty for numbers.
-        square: Equal scale on both axes.
         x_step: Distance of the ticks on the x axis; None for the renderer's choice.
     """
 

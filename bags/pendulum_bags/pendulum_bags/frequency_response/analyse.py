@@ -114,14 +114,10 @@ def analyse_responses(
     """Return the analysis of responses.
 
     Args:
-        responses: Simulation first.
-        plant: Preset or file of the plant that designs are made on.
         designs: As for :func:`pendulum_bags.frequency_response.designs.certify_designs`.
         scaling: Units of the gap; None for the thesis's task, or for several joints those of the LQR weights.
         margin: Gap between the plants that does not matter; None for 0.2, or for several joints the margin of the
             plant's own LQR, which a smaller gap keeps stable.
-        recorded: Whether the designs come from a recording, not from the caller.
-        longer: The command that measures longer.
 
     Raises:
         ParameterError: A text is no design; or the plant has other joints than the responses, or several motors.
@@ -188,8 +184,6 @@ def analyse_machine(machine: Path, plant: str, designs: Sequence[str] = (), ran:
     """Return which designs carry over to a machine that was measured before.
 
     Args:
-        machine: Measured response, or its folder.
-        plant: Preset or file of the plant that designs are made on.
         designs: As for :func:`pendulum_bags.frequency_response.designs.certify_designs`; by default those certified
             with the measurement, or else the thesis's four combinations.
         ran: Policy files that ran in the recording, certified too unless ``designs`` are given.

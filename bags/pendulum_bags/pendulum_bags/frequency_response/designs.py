@@ -124,8 +124,6 @@ def certify_designs(
         texts: ``q=100,0.01 r=0.1`` for LQR, positions before velocities, ``k=33,0.2`` for a gain; for one joint also a
             controller's name or a policy file. None for the thesis's four combinations, or for several joints the
             plant's own LQR and three with another cost of the effort.
-        plant: The plant.
-        certifier: Of its linear model and the measured machine.
         recorded: Whether they are from an earlier run: an unreadable policy file is then unknown.
         period: Of the simulation [s], which may stabilise what the hardware's longer one cannot.
 

@@ -40,9 +40,7 @@ class Record:
         outputs: Angle [rad] and velocity [rad/s] at each sample, shape (2, n); for k joints all positions, then all
             velocities, shape (2 k, n).
         disturbance: Parameters of the excitation; empty if unknown.
-        facts: Further facts on the run.
         joints: Names of the k joints; none for a plant of one.
-        driven: The joint with the excitation.
     """
 
     label: str

@@ -126,8 +126,6 @@ def spectrum_panels(result: Spectra, unit: str = "rad", of: str = "") -> list[Pa
     """Return power spectra and coherence of both velocities.
 
     Args:
-        result: The spectra.
-        unit: Of the position.
         of: Whose they are, for the titles, such as ``, elbow``.
     """
     frequency = result.frequency[1:]

@@ -42,10 +42,6 @@ def animation_of(data: ReportData) -> dict[str, Any]:
 def joint_animation(comparisons: Mapping[str, Comparison], plant: str) -> dict[str, Any] | None:
     """Return frames of both plants as points of their links [px].
 
-    Args:
-        comparisons: The comparison of each joint, by its name.
-        plant: Preset or file of the plant, whose links are drawn on both sides.
-
     Returns:
         The frames and the factor of enlargement; None where the plant is not known here, or not all its joints are.
     """

@@ -34,14 +34,10 @@ class ReportData:
     """The data of all figures and tables.
 
     Args:
-        comparison: The comparison.
         summary: Content of ``summary.json``.
-        replays: Real recordings driven through the plant's model.
-        names: Names of the run folders.
         trials: The thesis's identification experiments, where they were recorded.
         answer: The sum of all layers that were measured; by default of the comparison alone.
         certified: Which designs carry over to the hardware, where its frequency response was measured.
-        open_bag: How a bag is opened for data beyond the comparison.
     """
 
     comparison: Comparison

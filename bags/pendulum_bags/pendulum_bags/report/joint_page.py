@@ -32,8 +32,6 @@ def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: 
 
     Args:
         comparisons: The comparison of each joint, by its name, at least one.
-        answer: The answer for all joints.
-        title: Heading of the page.
     """
     first = next(iter(comparisons.values()))
     # The bag's metadata of its run hold for all joints.

@@ -58,23 +58,11 @@ class Page:
     """The contents of a report.
 
     Attributes:
-        title: What it is about.
-        answer: The answer, with its layers.
-        hardware: What the simulation was compared with, as in sentences.
         emulated: Whether the hardware was emulated; all texts name it so then.
-        is_paired: Whether both sides had one disturbance.
-        facts: Names and values at the head.
-        notes: Sentences below the answer, such as what was left out.
-        figures: Figures, drawn on the page by a script.
-        tables: Tables.
         provenance: Tables of where the data come from.
         surrogate: The surrogate of the hardware where none was measured.
         animation: Output of :func:`pendulum_bags.report.animation.animation_of`; None for no animation.
-        missing: Figures that the data do not allow, each with the reason.
         runs: How many runs there are; sections that show the first of several have a note.
-        unpaired: The answer without pairs, shown with the thesis's analysis.
-        noise_note: A sentence about noise that was held differently, shown there too.
-        others: Further simulated plants, by name, and their answers.
     """
 
     title: str
@@ -104,15 +92,7 @@ def page_of(
     *,
     title: str,
 ) -> Page:
-    """Return the page of plants of one joint.
-
-    Args:
-        data: What it is made from.
-        figures: Figures.
-        tables: Tables.
-        missing: Figures that the data do not allow, each with the reason.
-        title: What the page is about.
-    """
+    """Return the page of plants of one joint."""
     comparison = data.comparison
     warning = timing_warning(comparison.plants)
     return Page(

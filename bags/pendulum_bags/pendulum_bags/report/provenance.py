@@ -204,8 +204,6 @@ def citation(version: str, revision: str, year: str = "n.d.") -> str:
 
     Args:
         version: Of the software; empty where it is unknown.
-        revision: Of its source code.
-        year: In which the run was recorded.
     """
     release = f" (version {version})" if version else ""
     return f"{_AUTHORS} ({year}). {_TITLE}{release} [Computer software]. Git revision {revision}. No DOI is assigned."

@@ -50,15 +50,9 @@ def write_report(
         run_folder: Where the report goes; also the run folder (``sim``, ``hw``, perhaps ``sim_500hz``) to read unless
             ``comparison`` or ``folders`` is given.
         summary: Content of ``summary.json``; by default that of the comparison.
-        comparison: A comparison that has been made already.
-        folders: Run folders to pool.
         trials: Folders of the thesis's identification experiments, each with bags ``trial_1``, ``trial_2``, ...
-        recordings: Recordings of real pendulums to replay.
-        formats: Formats of the figures.
         answer: The sum of all layers; by default of the comparison and of the run folder.
         certified: Which designs carry over to the measured machine; by default by the run folder's response.
-        extend: Returns the page with what else was measured.
-        open_bag: How bags are opened.
 
     Returns:
         Path of the page.
@@ -106,11 +100,6 @@ def write_joint_report(
 
     Args:
         out: Where the report goes.
-        comparisons: The comparison of each joint, by its name.
-        folders: Run folders, or the two bags.
-        formats: Formats of the figures.
-        answer: The answer for all joints.
-        extend: Returns the page with what else was measured.
 
     Returns:
         Path of the page.

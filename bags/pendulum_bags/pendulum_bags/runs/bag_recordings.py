@@ -28,11 +28,9 @@ def read_bag_recording(
     A bag without any effort is that of a pendulum that swings freely.
 
     Args:
-        path: Bag folder or storage file.
         effort: ``applied``: topic ``applied_effort``, held until its next sample; ``measured``: the effort of
             ``joint_states``, varying linearly.
         namespace: For a bag with several plants, such as ``/sim``; by default the only one.
-        swings_freely: Nothing drives the pendulum, whatever effort the bag has.
 
     Raises:
         DataError: for a bag without joint states, several plants and no namespace, or too few samples.

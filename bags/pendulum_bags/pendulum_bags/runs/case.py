@@ -66,7 +66,6 @@ class Case:
         """Refuse a result of other plants; what is not known of one of them is not compared.
 
         Args:
-            other: The case of the result.
             where: Where the result is kept, for the message.
 
         Raises:

@@ -170,13 +170,7 @@ class Recording:
 
 
 def recording_of(motion: Motion, joint: JointMotion, hold: str | None = None) -> Recording:
-    """Return one joint of a recording.
-
-    Args:
-        motion: The recording.
-        joint: The joint.
-        hold: Of its input, in place of the mapping's.
-    """
+    """Return one joint of a recording."""
     drive, meta = joint.drive, dict(motion.meta)
     if drive is None:
         return Recording(motion.time, joint.position, joint.velocity, np.zeros_like(motion.time), "none", meta=meta)

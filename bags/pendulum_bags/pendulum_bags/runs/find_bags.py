@@ -15,7 +15,6 @@ def bags_below(folder: Path, suffixes: Collection[str] = ()) -> Iterator[Path]:
 
     Args:
         folder: Where to look, or a bag.
-        suffixes: Of files that are recordings too.
     """
     if folder.is_file():
         yield folder

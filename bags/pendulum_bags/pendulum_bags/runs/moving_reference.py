@@ -18,12 +18,7 @@ _FIELDS = {"reference": str, "set_point": float, "amplitude": float, "frequency"
 
 
 def follows_reference(metadata: Mapping[str, Any], space: str) -> bool:
-    """Tell whether the controller of a recorded run followed a reference that moved.
-
-    Args:
-        metadata: Metadata of the bag.
-        space: Namespace of the plant.
-    """
+    """Tell whether the controller of a recorded run followed a reference that moved."""
     recorded = _parameters(metadata, space)
     kinds = {recorded.get("controller"), record_named(run_record(metadata), "controller").get("kind")}
     return _KIND in kinds and recorded.get("amplitude") != 0.0
@@ -38,8 +33,6 @@ def recorded_reference(
     second or so after the first answer, is not in it.
 
     Args:
-        metadata: Metadata of the bag.
-        space: Namespace of the plant.
         times: Shape (n,) [s].
         first_answer: When the controller answered its first state [s].
     """

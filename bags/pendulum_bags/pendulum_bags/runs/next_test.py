@@ -28,7 +28,6 @@ def next_test_of(records: Sequence[Mapping[str, Any]], plant: str, bags: Sequenc
 
     Args:
         records: What bags say of their runs; the first that was an experiment is run again, under noise of none.
-        plant: The plant file.
         bags: The recordings; beside one of several joints lies its emulated machine, which is kept, not drawn again.
 
     Returns:

@@ -65,25 +65,16 @@ class RunData:
 
     Args:
         label: Name for tables and legends, such as ``sim``.
-        window: Motion during the noise.
-        whole: Motion of the whole recording, ramps included.
         disturbance: Disturbance torque as commanded, None where none was recorded [N m].
         applied: Torque that the plant says it applied, None where none was recorded [N m].
         measured: Measured joint torque over the whole recording, None where states have none [N m].
         arrival: Intervals between arrivals of states at the recorder during the noise, shape (n - 1,) [s].
         rate_hz: Sampling rate during the noise [Hz].
-        missed_deadlines: Periods during the noise for which the plant published no state.
-        metadata: What the bag says about its run.
         events: Events with ``name`` and ``t`` [s].
-        source: The bag.
-        damage: What is wrong with the bag.
-        follows_reference: Whether the controller followed a reference that moved.
         reference: That reference from upright, at the times of the window [rad]; None where it is not known.
         joint: Joint whose motion this is, of a plant of several; empty of a plant of one.
         followed: Reference of a file, over the whole recording, None of a bag [rad or m].
         recorded: Disturbance of a file; ``disturbance`` may be another signal that two files share.
-        of_file: Whether it is a recording that says nothing of an experiment.
-        guessed: Whether units, zero and sign of its columns are a guess.
     """
 
     label: str
@@ -171,9 +162,7 @@ def joints_of(
     """Return the joints of a bag's plant of several joints, in order; none of a plant of one, which needs no choice.
 
     Args:
-        path: The bag.
         prefix: As :func:`read_run` takes it.
-        open_bag: How the bag is opened.
 
     Raises:
         BagError: The bag cannot be read.
@@ -193,11 +182,6 @@ def shared_joints(
     readings: Sequence[Reading], prefixes: tuple[str | None, str | None] = (None, None), *, open_bag: OpenBag = read_bag
 ) -> dict[str, str | None]:
     """Return the joints that a simulation and its hardware have both, and their names at the hardware if others.
-
-    Args:
-        readings: The simulation's recording, then those of the hardware.
-        prefixes: Namespaces of simulation and hardware.
-        open_bag: How bags are opened.
 
     Raises:
         DataError: The recordings have no joint in common.
@@ -274,7 +258,6 @@ def read_run(
             else that of the first joint that has one.
         or_all: Whether the window is the whole recording where it has neither events nor a disturbance. Else it goes
             from the event ``noise_start`` to ``noise_end``, or from the first to the last sample of the disturbance.
-        open_bag: How the bag is opened.
 
     Raises:
         BagError: The bag cannot be read.
@@ -450,11 +433,7 @@ def is_in_lockstep(run: RunData) -> bool:
 
 
 def surrogate_of(run: RunData) -> str:
-    """Return what stood in for the hardware of a run in which no machine was measured.
-
-    Args:
-        run: The hardware's side.
-    """
+    """Return what stood in for the hardware of a run in which no machine was measured."""
     simulated = run_record(run.metadata).get(SURROGATE) == "simulation"
     return "a second simulation" if simulated else "an emulator"
 

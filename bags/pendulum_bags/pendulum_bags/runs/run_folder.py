@@ -59,7 +59,6 @@ def create_run_folder(out: Path | None, experiment: str) -> Path:
 
     Args:
         out: Where the user wants it; None for ``bags/runs/<UTC>_<experiment>`` below the current folder.
-        experiment: Name of the experiment.
 
     Raises:
         BagError: The folder exists and is not empty, or cannot be written.
@@ -125,8 +124,6 @@ def write_stall(folder: Path, reason: str, logs: str) -> None:
     """Add a run that a stalled machine broke off to what a run folder tells of itself.
 
     Args:
-        folder: The run's folder.
-        reason: Why it broke off, in words.
         logs: Folder of its logs within the run's folder; empty for none.
     """
     write_json(folder / _STALLS, {"stalls": [*read_stalls(folder), {"reason": reason, "logs": logs}]})

@@ -16,11 +16,7 @@ SURROGATE = "stand_in"
 
 
 def run_record(metadata: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the record of the run, empty where a bag has none, or something else under that name.
-
-    Args:
-        metadata: Metadata of the bag, by name.
-    """
+    """Return the record of the run, empty where a bag has none, or something else under that name."""
     return record_named(metadata, RUN_RECORD)
 
 

@@ -46,7 +46,6 @@ class Signal:
     Args:
         t: Stamps, strictly increasing, shape (n,) [s].
         value: Shape (n,).
-        name: For messages.
     """
 
     t: Array
@@ -80,7 +79,6 @@ class Series:
         position: Angle, continuous (not wrapped), shape (n,) [rad]; of a joint that slides, its place [m].
         velocity: Shape (n,) [rad/s or m/s].
         effort: Torque of the controller in answer to each state, shape (n,) [N m or N]; 0 of a joint without a motor.
-        name: For messages and legends.
         unit: Of the position, ``rad`` or ``m``.
         drive_unit: Of the effort, where it is no torque or force; else empty.
     """

@@ -53,7 +53,6 @@ def carry_out(
         task: Function of a module (a worker imports it) of the job, the number, and how many threads to take, None
             for all.
         job: What all pieces have in common; it travels to the workers.
-        missing: Numbers to carry out.
         connect: To a Dask cluster (`cluster_client`), not called where nothing is missing; by default one after the
             other is carried out in this process.
 
@@ -85,10 +84,6 @@ def run_chunks(
     Args:
         folder: Where the files go.
         task: Returns the columns of a chunk; else as in ``carry_out``, like ``job`` and ``connect``.
-        job: What all chunks have in common.
-        chunks: How many there are.
-        connect: To a Dask cluster.
-        on_progress: Called with chunks done and in all.
 
     Raises:
         FaultError: As ``carry_out``.
@@ -174,9 +169,6 @@ def open_results(folder: Path, what: str, fingerprint: str, settings: Mapping[st
 
     Args:
         folder: Where the results go.
-        what: Their name, for messages.
-        fingerprint: Hash of all that they depend on.
-        settings: For readers of the folder.
 
     Raises:
         BagError: The folder holds something else.

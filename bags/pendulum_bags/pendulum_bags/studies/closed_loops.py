@@ -37,13 +37,9 @@ class ClosedLoops:
 
     Attributes:
         plant: Preset or file of the nominal plant; the controller is designed on it.
-        uncertainty: Of its parameters.
         q: Diagonal of Q; plants of several joints have their own weights.
-        r: R, likewise.
-        method: Integrator of one joint.
         duration: Of each run [s].
         dt: Period of the loop [s].
-        seed: Seed of everything.
         device: Where the batches run, ``cpu`` or ``cuda``.
     """
 

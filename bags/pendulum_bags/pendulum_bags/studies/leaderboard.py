@@ -86,13 +86,8 @@ class Entry:
     """One line of the board.
 
     Attributes:
-        plant: Preset.
-        controller: Kind.
         reason: Why it is not scored; empty where it is.
-        success: Whether it was up for all of the last second.
-        costs: By name.
         scores: By version, v1 to v3.
-        robustness: Share of successes by kind of perturbation.
         wall: Time that the plain run took [s].
         motion: Time [s], angle from upright [rad], applied torque [N m], thinned, shape (3, n); for plots.
     """
@@ -206,9 +201,6 @@ def entry_of(
     """Return the line of a controller.
 
     Args:
-        plant: As the board names it.
-        controller: Kind.
-        run: Carries out the plain run.
         perturbed: Kind and runs of each perturbation; not evaluated where the plain run fails.
         patience: Wall time of the plain run beyond which no perturbation is tried [s].
     """
@@ -244,11 +236,8 @@ def evaluate(
     """Return the line of a controller: from hanging down to upright, on the plant that it was designed for.
 
     Args:
-        plant: Preset or file of a rigid plant.
-        controller: Kind.
         parameters: Of the controller; by default its own.
         duration: Length of each run [s].
-        robustness: Whether to try the perturbations.
     """
     true = load_plant(plant)
     # Hanging exactly down is an equilibrium that no torque of an energy controller leaves.

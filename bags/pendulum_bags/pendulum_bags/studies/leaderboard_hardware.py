@@ -38,10 +38,6 @@ _STRATEGY = "direct_pwm"
 def arrays_of_bag(bag: Path, namespace: str) -> RunArrays:
     """Return a recorded run as the board's arrays.
 
-    Args:
-        bag: The bag of a run in lockstep.
-        namespace: Of its plant.
-
     Raises:
         DataError: States and torques do not belong together.
     """
@@ -89,10 +85,8 @@ def evaluate_hardware(
     """Return the line of a controller on the emulated machine: from hanging down to upright, over DDS.
 
     Args:
-        controller: Kind.
         parameters: Of the controller; by default its own.
         duration: Length of each run [s].
-        robustness: Whether to try the perturbations.
         hosts: Run the programs; without them others do, which end with the line.
     """
     spec: dict[str, Any] = {

@@ -31,8 +31,6 @@ def write_page(path: Path, entries: Sequence[Entry], duration: float) -> Path:
     """Write the page and return its path.
 
     Args:
-        path: The HTML file.
-        entries: The lines.
         duration: Length of each run [s].
     """
     plants: dict[str, list[dict[str, Any]]] = {entry.plant: [] for entry in entries}

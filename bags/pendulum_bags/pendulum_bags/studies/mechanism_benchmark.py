@@ -47,14 +47,7 @@ _LINE = 0.9
 
 
 class Criterion(NamedTuple):
-    """What a swing-up costs.
-
-    Attributes:
-        name: Key.
-        title: Name in tables.
-        unit: Its unit.
-        norm: n in tanh(pi c / n).
-    """
+    """What a swing-up costs."""
 
     name: str
     title: str
@@ -77,8 +70,6 @@ class Published:
     """A row of the public boards.
 
     Attributes:
-        method: Its name there.
-        plant: acrobot or pendubot.
         score: Score v2; None where it is not on that board.
         robustness: Overall robustness, v2.
         uptime_score: Score v3, of 2025.
@@ -117,9 +108,6 @@ PUBLISHED = (
 def benchmark_plant(name: str) -> PlantParameters:
     """Return the plant that the benchmark's boards simulate: design C.1 without friction and rotors, 6 N m.
 
-    Args:
-        name: acrobot or pendubot.
-
     Raises:
         ParameterError: Another name.
     """
@@ -132,7 +120,6 @@ def is_above_line(plant: PlantParameters, states: Array) -> NDArray[np.bool_]:
     """Return where the tip is above the line.
 
     Args:
-        plant: A double pendulum.
         states: [shoulder, elbow, their velocities], shape (N, 4).
     """
     chain = in_arithmetic(plant.mechanism.chain, np)
@@ -152,7 +139,6 @@ def criteria_of(plant: PlantParameters, times: Array, states: Array, efforts: Ar
     public implementation it ignores the first and the last sample.
 
     Args:
-        plant: The plant.
         times: Of the samples, shape (N,) [s].
         states: [shoulder, elbow, their velocities] at these times, shape (N, 4).
         efforts: Torques from each of these times on, both joints, shape (N, 2) [N m].

@@ -25,8 +25,6 @@ def write_swing_up_figure(path: Path, plant: PlantParameters, rows: Sequence[Row
 
     Args:
         path: The picture; its suffix is the format.
-        plant: The plant.
-        rows: What was run.
     """
     from matplotlib.figure import Figure
 

@@ -156,7 +156,6 @@ def make_stepper(plant: PlantParameters, *, compiled: bool = True) -> Stepper:
 
     Args:
         plant: A double pendulum; its own numbers do not matter.
-        compiled: Compile with numba, some seconds once.
     """
     bare, along = plant.mechanism.forward, along_functions(2)
     step: Any = rk4_joints
@@ -197,10 +196,8 @@ def simulate(
     Args:
         plant: The plant of the controller's model; differences from it are in ``disturbances``.
         stepper: Of :func:`make_stepper`.
-        answer: Torques of both joints for (time, measured state).
         steps: Steps of 2 ms.
         disturbances: None for none.
-        seed: Of the noise.
         limits: Of both joints [N m]; none for the plant's own, 0 where it is passive.
     """
     what = disturbances or Disturbances()
@@ -255,7 +252,6 @@ def robustness_trials(plant: PlantParameters, seed: int = 1) -> list[Trial]:
     """Return the 722 runs of the six tests of robustness, each with a seed of its own.
 
     Args:
-        plant: The plant.
         seed: Of noise and kicks; the public implementation draws new ones each time.
     """
     trials: list[Trial] = []

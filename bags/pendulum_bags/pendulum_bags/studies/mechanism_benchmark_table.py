@@ -36,13 +36,9 @@ class Row:
     """What a controller reached.
 
     Attributes:
-        controller: Its name.
         score: Score v2.
-        criteria: Of its swing-up.
         robustness: Overall robustness, v2; None where it was not tested.
-        shares: Levels held, by kind of disturbance.
         uptimes: Scores v3, one for each seed.
-        run: The swing-up.
     """
 
     controller: str
@@ -64,14 +60,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Bench:
-    """What all jobs of a benchmark share.
-
-    Attributes:
-        plant: acrobot or pendubot.
-        names: Controllers.
-        seed: Of noise and kicks.
-        compiled: Compile the simulation, which is worth its seconds for more than some runs.
-    """
+    """What all jobs of a benchmark share."""
 
     plant: str
     names: tuple[str, ...]

@@ -55,7 +55,6 @@ class MonteCarlo(ClosedLoops):
     """What to draw and to run.
 
     Attributes:
-        runs: Number of closed-loop runs.
         amplitude: Largest noise on each driven joint; None for a tenth of its effort limit [N m or N].
         hold_time: Time for which a noise sample is held [s].
         start: Largest distance of each joint's start from upright, uniform [rad or m].
@@ -171,7 +170,6 @@ def replay(settings: MonteCarlo, number: int) -> tuple[dict[str, float], Array]:
     """Run one run again, alone, and return what was drawn for it and its motion.
 
     Args:
-        settings: As of the Monte Carlo.
         number: Of the run, from 0.
 
     Returns:
@@ -197,9 +195,7 @@ def run_monte_carlo(
 
     Args:
         folder: Where the files go; a folder of the same settings is continued, one of fewer runs is added to.
-        settings: What to run.
         connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
-        on_progress: Called with chunks done and in all.
 
     Raises:
         BagError: The folder holds something else, or more runs.

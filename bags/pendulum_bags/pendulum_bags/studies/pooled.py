@@ -24,8 +24,6 @@ def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) ->
     """Return the pooled comparison of the thesis's experiments, or the parameters of all identification experiments.
 
     Args:
-        folder: Of the study.
-        study: The study.
         records: Of its runs; those that failed are left out.
     """
     done = {int(record["number"]) for record in records if record["status"] == "done"}

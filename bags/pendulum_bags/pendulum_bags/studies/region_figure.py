@@ -16,7 +16,6 @@ def write_region_figure(path: Path, result: RegionResult) -> Path:
 
     Args:
         path: The picture; its suffix is the format.
-        result: The map.
     """
     from matplotlib import patheffects
     from matplotlib.figure import Figure

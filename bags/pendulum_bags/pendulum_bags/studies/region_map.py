@@ -43,8 +43,6 @@ class Axis:
 
     Attributes:
         name: A joint, or a joint and ``_dot`` for its velocity.
-        span: Half width of the grid about upright at rest.
-        unit: Unit of both.
         index: Which of the states [positions, velocities] it is.
     """
 
@@ -211,9 +209,7 @@ def run_map(
 
     Args:
         folder: Where the files go; a folder of the same settings is continued.
-        settings: What to map.
         connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
-        on_progress: Called with chunks done and in all.
 
     Raises:
         BagError: The folder holds something else.
@@ -281,7 +277,6 @@ class RegionResult:
     """The map.
 
     Attributes:
-        settings: What was mapped.
         share: Share of the plants that reach upright, shape (second axis, first axis).
         believed: Whether the nominal plant does, same shape.
         turned: Share of the plants of one joint that reach it after going round, same shape.

@@ -47,10 +47,7 @@ class Group:
     """All runs that differ in seed and repeat only.
 
     Attributes:
-        labels: Their names on the other axes.
-        seeds: Of the runs.
         values: Metric -> one value for each run; infinity where it did not happen.
-        failed: How many runs failed.
     """
 
     labels: Mapping[str, Any]
@@ -85,7 +82,6 @@ def episode_of_run(place: Path, spec: RunSpec) -> Episode:
 
     Args:
         place: Folder of the run, with ``bag`` or ``run.npz``.
-        spec: The run.
 
     Raises:
         DataError: There is neither, or it has no states.
@@ -118,9 +114,7 @@ def write_outcome(place: Path, spec: RunSpec | None, labels: Mapping[str, Any], 
     Args:
         place: Folder of the run, with ``bag`` or ``run.npz``.
         spec: The run, of which metrics are stored where it has one joint; None for none.
-        labels: Its place in the study, such as its controller.
         failure: Why it failed; empty where it did not.
-        **more: What else is stored.
     """
     record: dict[str, Any] = {**more, "labels": dict(labels)}
     if not failure and spec is not None and spec.mechanism is None:

@@ -33,12 +33,7 @@ class StudyProgress:
     """Where a study is.
 
     Attributes:
-        total: Runs in the matrix.
-        done: Runs finished, those of earlier calls among them.
-        failed: Runs that failed.
-        skipped: Runs that were there already.
         remaining: Expected wall time until the end [s].
-        running: Names of the runs that are under way.
     """
 
     total: int
@@ -126,9 +121,7 @@ def run_study(
     Args:
         folder: As :func:`open_study_folder` made it.
         study: The study, as :func:`open_study_folder` returned it.
-        workers: Runs at once.
         retry_failed: Carry out again those that failed; else they stay failed.
-        on_progress: Called several times a second.
         before_machine: Called before each run that moves a real machine; what it raises ends the study, which resumes
             from there when it is started again.
 

@@ -35,7 +35,6 @@ def analyse(folder: Path, study: Study) -> list[dict[str, Any]]:
     Writes ``figures/strategies.png`` and ``.pdf``.
 
     Args:
-        folder: Of the study.
         study: The study; its first plant of side ``sim`` is the simulation that the others are compared with.
     """
     motions: dict[str, tuple[Array, Array]] = {}

@@ -64,7 +64,6 @@ class StudyRun:
         engine: ``nodes`` over DDS, or ``process``: the same pieces in one process.
         arguments: For other experiments: what follows ``python -m pendulum_bags experiment``, but ``--out``.
         seconds: Expected wall time [s].
-        bytes: Expected size on disk.
     """
 
     number: int
@@ -108,14 +107,8 @@ class Study:
     """A study.
 
     Attributes:
-        name: Its name.
-        description: Its question, one sentence.
         experiment: What each cell is: ``run`` in lockstep, or one of the experiments with a name.
-        analysis: What is made of the runs.
-        runs: The matrix.
-        text: The file, as it is stored next to the results.
         clock: ``lockstep``, as fast as possible, or ``realtime``.
-        left_out: Why each optional controller is left out whose library is not installed, one sentence each.
     """
 
     name: str
@@ -171,8 +164,6 @@ def load_study(
     """Read a study file, or one of the shipped studies by name.
 
     Args:
-        source: Path, or name of a shipped study.
-        seeds: Seeds to use in place of the file's.
         plants: By side, entries that its plants get in place of the file's, such as ``{"sim": {"plant": "x5_9"}}``.
 
     Raises:

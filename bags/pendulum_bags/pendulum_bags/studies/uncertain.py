@@ -94,9 +94,7 @@ class Uncertainty:
         """Return pendulums for standard normal numbers of shape (len(VARIED), n): log-normal about the plant's values.
 
         Args:
-            plant: The nominal plant.
             normals: One row for each of ``VARIED``.
-            correlated: False takes the parameters for independent.
         """
         factor, variances = self._factor(correlated=correlated)
         logarithms = np.zeros_like(normals)
@@ -158,7 +156,6 @@ def parse_uncertainty(text: str, plant: str) -> Uncertainty:
         text: ``identified`` for what an identification left in the plant file; one share for all parameters, such as
             ``0.05``; or ``NAME=SHARE,...``, such as ``inertia=0.3`` or ``cart_mass=0.1,pole.damping=0.5``. Empty for
             none.
-        plant: Preset or plant file.
 
     Raises:
         ParameterError: A name is none of the plant, a share is none, or the file has no intervals.

@@ -32,7 +32,6 @@ def answer_of(
         compared: The first layer, or that of each joint by its name, at least one.
         folders: Folders that may have further layers: of the run, or of experiments that measured them.
         more: How to record more if that is missing.
-        updated: Layers that were judged again, and replace those of the folders.
         how: The command that measures a layer, if it differs for the recordings' plants.
         refused: Why no plant could be identified from the recordings, as a sentence; empty if not tried.
 

@@ -36,12 +36,7 @@ class Mark(str, Enum):
 
 
 class Layer(Enum):
-    """The four questions, from the narrowest to the widest.
-
-    Attributes:
-        key: Name in JSON and of files.
-        title: Name in tables.
-    """
+    """The four questions, from the narrowest to the widest."""
 
     key: str
     title: str
@@ -73,12 +68,10 @@ class Evidence:
     """One measured quantity of a layer.
 
     Args:
-        quantity: Name of the quantity.
         unit: Its unit; empty for none.
         estimate: Its value; None if it does not exist.
         low: Lower end of its interval, or None.
         expected: The criterion as text, such as ``within ±0.3 deg``; empty for mere information.
-        note: A remark for the reader.
     """
 
     quantity: str
@@ -105,13 +98,11 @@ class LayerResult:
     """The result of one layer.
 
     Args:
-        sentence: The result as a sentence that needs no context.
         next_steps: One sentence or command each; empty if there is nothing to do.
         reason: Clause for the whole answer, without a full stop: why it is no or undecided, such as "the spread of the
             velocity is 31 % smaller on the hardware".
         holds: Clause with what is reliable although another layer is no, such as "designs with a margin above 0.21
             stabilise the hardware too"; empty for nothing.
-        case: The plants that it is of.
     """
 
     layer: Layer
@@ -161,12 +152,8 @@ class Answer:
     """The sum of all layers.
 
     Args:
-        mark: Yes, no or undecided.
-        reasons: Why, as a clause.
-        layers: One result for each layer, in order.
         decides: Which of two contradicting tests decides about what, as a sentence; empty if none contradict.
         holds: Clause with what remains true although the answer is not yes; empty for nothing.
-        missing: Titles of layers that a yes lacks.
         text: The answer as text if it is more than the sum of these.
     """
 

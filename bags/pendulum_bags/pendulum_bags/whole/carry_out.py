@@ -87,14 +87,9 @@ class Order:
     """What is wanted.
 
     Attributes:
-        settings: The given plant, the machine, controller and noise.
-        margins: What difference does not matter.
         budget: Longest wall time of what follows the first recordings; 0 for one analysis of these alone [s].
         steps: Of :data:`STEPS`.
-        contenders: Controllers of the ranking.
-        seeds: Seeds of the noise under which each of them runs.
         domain: ROS domain of the run in real time; None for any free one.
-        multisine: What measures frequencies.
         designs: Designs to certify, as text; none for the default ones.
     """
 
@@ -146,9 +141,6 @@ class Simulated:
     """One simulated plant, and what was found of it beside the machine.
 
     Attributes:
-        name: As sentences name it.
-        settings: What ran.
-        folder: Of its recordings.
         budget: That of the next run where this one's did not suffice; 0 where more of it measures nothing [s].
         comparisons: Of each joint; empty before the first analysis.
         refused: Why no other plant could be identified from these recordings; empty where none was tried.
@@ -225,11 +217,8 @@ def carry_out(
     """Record, identify and compare; what is found when the budget ends or the user interrupts is returned.
 
     Args:
-        folder: The run's folder.
-        order: What is wanted.
         progress: Shows where it is.
         leaving: Ends the programs and leaves the graph; close it when everything is written.
-        on_first: Called with the given plant when its first layer is there.
 
     Raises:
         FaultError: The first recordings failed.

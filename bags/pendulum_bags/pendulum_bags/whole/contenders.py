@@ -81,11 +81,7 @@ def contender_specs(
     refuses the plant does not contend.
 
     Args:
-        sim: The simulation under any controller and disturbance.
-        hw: The hardware likewise.
         count: Number of contenders, fewer where fewer differ.
-        seed: First seed of the hardware.
-        seeds: Number of seeds.
     """
     found: dict[str, list[tuple[RunSpec, RunSpec]]] = {}
     seen: list[Any] = []
@@ -114,9 +110,6 @@ def keep_run(place: Path, name: str, spec: RunSpec, failure: str = "") -> None:
     """Store what a run of a ranking is, and its metrics, as a study does; its bag or arrays are in the folder.
 
     Args:
-        place: Folder of the run.
-        name: Of its controller.
-        spec: The run.
         failure: Why the plant stopped; empty where it did not.
     """
     write_json(place / "spec.json", spec.to_json())
@@ -130,8 +123,6 @@ def simulate_contenders(
 
     Args:
         folder: Where to.
-        specs: Runs of each contender.
-        before: Called before each run.
     """
     for name, runs in specs.items():
         for spec in runs:

@@ -42,11 +42,7 @@ def write_whole_report(
     """Write ``report.html`` and ``figures/`` of a run; return the page.
 
     Args:
-        folder: The run's folder.
         summary: Content of ``summary.json``.
-        found: What the run found.
-        answer: The answer that takes all in.
-        answers: That of each plant.
     """
     given = found.given
 

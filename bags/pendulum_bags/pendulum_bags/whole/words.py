@@ -13,11 +13,7 @@ __all__ = ["whole_answer"]
 
 
 def whole_answer(found: Findings) -> tuple[Answer, list[Answer]]:
-    """Return the answer for the given plant, with a text and next steps that take all in, and that of each plant.
-
-    Args:
-        found: What the run found.
-    """
+    """Return the answer for the given plant, with a text and next steps that take all in, and that of each plant."""
     plants = found.plants
     answers = [plant.answer() for plant in plants]
     given, choice = answers[0], _choice(plants, answers)

@@ -31,12 +31,7 @@ def offered(plant: str) -> list[str]:
 
 
 class ControllerChoice:
-    """One plant's choice.
-
-    Args:
-        carefully: Awaits work and shows its refusal.
-        button: Makes a button from a text, its action, and the plant's name.
-    """
+    """One plant's choice."""
 
     def __init__(
         self,

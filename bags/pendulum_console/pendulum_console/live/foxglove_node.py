@@ -53,7 +53,6 @@ class LiveOptions:
     Args:
         port: Port; 0 for any.
         token: Token of a client; empty on loopback.
-        origins: Origins of pages that may connect to loopback besides the known viewers.
     """
 
     host: str = "127.0.0.1"

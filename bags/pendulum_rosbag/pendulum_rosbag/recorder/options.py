@@ -25,8 +25,6 @@ class RecorderOptions:
     Args:
         output: Folder of the bag; it must not exist.
         topics: Full topic names; empty for all (but ``/rosout`` and ``/parameter_events``).
-        regex: Pattern that a topic may match instead of being listed.
-        exclude: Pattern of topics to leave out.
         storage: ``mcap`` or ``sqlite3``.
         compression: ``None`` or ``zstd``.
         max_size: Largest storage file [bytes]; 0 for no limit.
