@@ -145,7 +145,7 @@ def find_pieces(folders: Sequence[Path], questions: Sequence[str], how: Reading 
 
 
 def _distinct(bags: Mapping[Path, str]) -> dict[Path, str]:
-    """Return the bags with names that differ: where two have one, all are named from the folder that holds them all."""
+    """Return the bags with distinct names, from their common folder where two are alike."""
     if len(set(bags.values())) == len(bags):
         return dict(bags)
     common = Path(os.path.commonpath([path.parent for path in bags]))
@@ -196,7 +196,7 @@ def analyse_bags(
 
 
 def _ask(job: tuple[Sequence[Piece], Sequence[str], str], index: int, _threads: int | None) -> list[Row]:
-    """Return the rows of a piece; a failure is reported in the row and does not stop the others."""
+    """Return the rows of a piece; a failure is reported in its row."""
     pieces, questions, out = job
     piece = pieces[index]
     if not Path(piece.path).exists():
@@ -236,14 +236,12 @@ def _answer(row: Row, questions: Sequence[Callable[..., Mapping[str, Any]]], *ar
 
 
 def _sentence(error: Exception) -> str:
-    """Return why there is no result; an unexpected error is reported with its type."""
     if isinstance(error, PendulumError):
         return str(error)
     return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
 
 
 def _guessed(reading: Reading) -> str:
-    """Return what was guessed of a recording, in one cell."""
     return "; ".join(
         f"{one.quantity}: {one.column} [{one.unit}]{' (assumed)' * one.assumed}" for one in reading.guesses if one.unit
     )
@@ -255,7 +253,6 @@ def _plants(bag: Bag) -> list[str]:
 
 
 def _run_facts(bag: Bag) -> Row:
-    """Return the bag's facts about its run that fit a table."""
     run = run_record(bag.metadata)
     controller = run.get("controller")
     kind = controller.get("kind") if isinstance(controller, Mapping) else controller

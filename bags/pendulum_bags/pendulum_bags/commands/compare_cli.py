@@ -186,7 +186,6 @@ def compare(
 def _judge(
     results: Mapping[str, Comparison], kept: Sequence[Path], machine: Path | None, designs: Sequence[str]
 ) -> tuple[Answer, dict[str, Any], Sequence[DesignResult]]:
-    """Return the answer, its JSON, and the designs with a known certificate."""
     from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
     from pendulum_bags.verdict.answer import answer_of
 

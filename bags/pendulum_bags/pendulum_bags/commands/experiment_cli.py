@@ -311,7 +311,7 @@ def examples(
 
 
 def _running(settings: RegulationSettings, domain: int | None, plant: str | None) -> list[str]:
-    """Return the namespaces of the plants that run already, where the rest of the command line fits them."""
+    """Return the namespaces of plants that run already, if the rest of the command line fits them."""
     found = [settings.namespace(side) for side in SIDES if settings.running(side) is not None]
     if found and domain is None:
         raise ParameterError(f"plant {found[0]} runs on a ROS domain; expected --domain N, or ROS_DOMAIN_ID")

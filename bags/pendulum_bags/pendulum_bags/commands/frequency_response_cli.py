@@ -243,7 +243,6 @@ def _tell(console: Console, analysis: Analysis, out: Path | None, *, json_output
 
 
 def _extent(facts: Mapping[str, Any]) -> str:
-    """Return a plant's largest motion and torque during the measurement, as text."""
     if "largest_deviation" in facts:
         deviations = ", ".join(f"{joint} {value:.3g}" for joint, value in facts["largest_deviation"].items())
         return f"largest deviations {deviations} rad or m, largest effort {facts['largest_effort']:.3g} N m or N"

@@ -150,7 +150,7 @@ def identify(
 def _finish(
     result: IdentificationResult, written: Path | None, page: bool, as_json: bool, *, contradicts: bool = False
 ) -> None:
-    """Write the page, print the result; exit with 3 where it is not to be believed."""
+    """Write the page, print the result; exit with 3 where it is not credible."""
     if written is not None and page:
         from pendulum_bags.identification.page import write_page
 
@@ -164,7 +164,7 @@ def _finish(
 
 
 def _refuse_unheeded(context: typer.Context, way: str, heeded: Collection[str]) -> None:
-    """Refuse options that were given and would change nothing: whoever gives one relies on it."""
+    """Refuse options that would have no effect."""
     if unheeded := typed_options(context, set(context.params) - {"data", *heeded}):
         raise DataError(
             f"{', '.join(unheeded)} has no effect with {way}; expected none but "
@@ -241,7 +241,7 @@ def _print_thesis(result: ThesisResult, *, verbose: bool) -> None:
 
 
 def _narrow(summary: str, width: int = 78) -> str:
-    """Make the head of statsmodels' summary, widened by its labels, as narrow as the rest: blanks of it go."""
+    """Remove blanks from the head of statsmodels' summary, which its labels widened."""
     lines = [line.rstrip() for line in summary.splitlines()]
     rules = [index for index, line in enumerate(lines) if line and not line.strip("=")]
     excess = len(lines[rules[0]]) - width if len(rules) > 1 else 0

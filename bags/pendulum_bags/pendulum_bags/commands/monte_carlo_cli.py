@@ -140,7 +140,6 @@ def settings_of(context: typer.Context, kind: type[Study], one_only: Collection[
 
 
 def _replay(console: Console, settings: MonteCarlo, number: int, folder: Path) -> None:
-    """Write the motion of a run as CSV, and print what was drawn for it."""
     import numpy as np
 
     from pendulum_bags.studies.monte_carlo import replay
@@ -162,7 +161,6 @@ def _replay(console: Console, settings: MonteCarlo, number: int, folder: Path) -
 
 
 def _print(console: Console, settings: MonteCarlo, result: dict[str, Any]) -> None:
-    """Print the probability, what is uncertain, the quantiles, the worst runs, and the indices where there are some."""
     from pendulum_bags.identification.model import UNITS
 
     uncertainty, joints = settings.uncertainty, result["joints"]

@@ -91,11 +91,7 @@ def move(
 
 @contextmanager
 def _unless_confirmed(namespace: str) -> Iterator[None]:
-    """Print what to do where a plant does not confirm its e-stop, soon and at the end.
-
-    Raises:
-        FaultError: It was not confirmed.
-    """
+    """Print what to do where a plant does not confirm its e-stop, soon and at the end; then a FaultError."""
     advice = "stop the machine by its own means (motion stop, power)"
     soon = threading.Timer(
         _SOON, lambda: print(f"{namespace}: e-stop is not confirmed yet; {advice}", file=sys.stderr, flush=True)
@@ -111,7 +107,6 @@ def _unless_confirmed(namespace: str) -> Iterator[None]:
 
 
 def _angle(text: str) -> float:
-    """Return the angle that a goal is [rad]."""
     try:
         angle = float(text)
     except ValueError:

@@ -177,7 +177,7 @@ def _of_joint(folder: Path, joint: str) -> dict[str, object] | None:
 
 
 def _summary(folder: Path) -> dict[str, object] | None:
-    """Return the run's own summary, which has its settings; a damaged one is ignored."""
+    """Return the run's own summary with its settings; a damaged one is ignored."""
     try:
         content = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -269,7 +269,6 @@ def _study(
 def _analyse(
     folder: Path, found: Study, records: Sequence[dict[str, Any]]
 ) -> tuple[dict[str, Any], Callable[[Console], None]]:
-    """Return the results of the runs, for ``results.json``, and the function that prints them."""
     from pendulum_bags.runs.run_folder import write_json
     from pendulum_bags.studies import pid_vs_lqr, pooled, strategies
     from pendulum_bags.studies.results import group_runs, groups_to_json

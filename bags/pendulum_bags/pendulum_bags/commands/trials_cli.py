@@ -135,11 +135,7 @@ def _plan(settings: TrialSettings) -> str:
 
 
 def _ask(console: Console, sentence: str) -> None:
-    """Show a sentence and wait for Enter; without a terminal there is no Enter.
-
-    Raises:
-        PendulumError: The input has ended.
-    """
+    """Show a sentence and wait for Enter, if there is a terminal; a PendulumError if the input has ended."""
     console.print(sentence)
     try:
         input()

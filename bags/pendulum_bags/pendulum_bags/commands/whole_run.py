@@ -166,7 +166,6 @@ def _summary(experiment: str, found: Findings, answer: Answer, answers: Sequence
 
 
 def _print_first(console: Console, plant: Simulated, *, json_output: bool) -> None:
-    """Print the first layer of the given plant, while the others are measured."""
     if not json_output:
         if "" in plant.comparisons:
             _print_summary(console, plant.comparison, plant.settings.hardware)

@@ -1,4 +1,4 @@
-"""By how much one recording lags another: normalised cross-correlation, with the whole curve for inspection."""
+"""Delay of one recording relative to another by normalised cross-correlation."""
 
 from __future__ import annotations
 
@@ -18,13 +18,7 @@ LONGEST_LAG = 0.25
 
 @dataclass(frozen=True)
 class Alignment:
-    """Result of an alignment.
-
-    Args:
-        delay: By how much the second lags the first; negative where it leads [s].
-        lags: Lags tried, shape (n,) [s].
-        curve: Correlation at each, shape (n,).
-    """
+    """Delay of the second signal [s], negative where it leads; ``curve`` is the correlation at each of ``lags`` [s]."""
 
     delay: float
     correlation: float
@@ -44,10 +38,7 @@ class Alignment:
 
 
 def cross_correlation(first: Array, second: Array, reach: int) -> Array:
-    """Return the correlation coefficient of first[k] and second[k + lag] at lags -reach to reach, shape (2 reach + 1,).
-
-    Each coefficient uses the samples that overlap at its lag, centred and scaled on those samples.
-    """
+    """Return the correlation of first[k] and second[k + lag] at lags -reach to reach, over the overlap at each lag."""
     curve = np.zeros(2 * reach + 1)
     size = first.size
     for i, lag in enumerate(range(-reach, reach + 1)):
@@ -79,10 +70,7 @@ def _peak(first: Array, second: Array, period: float, of: str) -> Alignment:
 
 
 def align_motion(first: Series, second: Series) -> Alignment:
-    """Estimate how much the second motion lags the first, from their velocities.
-
-    Velocity, not angle: the angle of a regulated pendulum changes slowly, and its correlation has a flat top.
-    """
+    """Estimate the second motion's delay from the velocities: the correlation of regulated angles has a flat top."""
     period = min(first.period, second.period)
     start, stop = max(first.t[0], second.t[0]), min(first.t[-1], second.t[-1])
     times = uniform_times(float(start), float(stop), period)
@@ -91,11 +79,7 @@ def align_motion(first: Series, second: Series) -> Alignment:
 
 
 def align_signals(first: Signal, second: Signal, period: float) -> Alignment:
-    """Estimate how much the second signal lags the first; both are held from sample to sample.
-
-    Args:
-        period: Resolution of the lags [s].
-    """
+    """Estimate the delay of the second signal at lags of ``period`` [s]; both are held from sample to sample."""
     start, stop = max(first.t[0], second.t[0]), min(first.t[-1], second.t[-1])
     if not stop > start:
         raise DataError(f"{first.name} and {second.name} share no time; expected signals that overlap")

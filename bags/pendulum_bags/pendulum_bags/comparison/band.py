@@ -1,4 +1,4 @@
-"""Motions limited to a band that both plants can see, so that sampling at another rate is no difference."""
+"""Filters motions to a band that both plants resolve, so that different sampling rates make no difference."""
 
 from __future__ import annotations
 
@@ -24,17 +24,13 @@ def common_band(band: float, *series: Series) -> float:
 class SlowClock:
     """The stamps of the slower of two motions, at which the faster one is evaluated too.
 
-    A plant that is sampled at 100 Hz under noise that changes every 10 ms is sampled at one phase of it only; its
-    velocity at that phase spreads by up to a quarter more or less than over all phases. No filter undoes that, for
-    what was not sampled is lost. So the faster motion is taken at the very same phases, where it has the same images,
-    and both are then filtered in the same way.
+    A plant sampled at 100 Hz under noise that changes every 10 ms is seen at one phase of the noise only, where its
+    velocity spreads by up to a quarter more or less. No filter restores that, so the faster motion is resampled at the
+    same phases before both are filtered.
 
     Args:
         stamps: Of the slower motion, strictly increasing, shape (n,) [s].
-        band: Band to keep [Hz].
-
-    Raises:
-        DataError: The motion is sampled too slowly for the band, or too short.
+        band: Upper edge of the band [Hz]; a DataError if the motion is sampled too slowly for it, or too short.
     """
 
     def __init__(self, stamps: Array, band: float) -> None:
@@ -56,10 +52,7 @@ class SlowClock:
         return np.interp(self._even, self._index, self.times)
 
     def filtered(self, values: Array) -> Array:
-        """Return values at the stamps, shape (n, ...), without what lies above the band, at the even times.
-
-        Gaps are filled linearly.
-        """
+        """Return values at the stamps, shape (n, ...), low-passed, at the even times; gaps are filled linearly."""
         if self._even.size != self._index.size:
             left = np.clip(np.searchsorted(self._index, self._even, side="right") - 1, 0, self._index.size - 2)
             share = (self._even - self._index[left]) / (self._index[left + 1] - self._index[left])
@@ -68,7 +61,7 @@ class SlowClock:
         return self.filtered_even(values)
 
     def filtered_even(self, values: Array) -> Array:
-        """Return values at even times, shape (n, ...), without what lies above the band."""
+        """Return values at even times, shape (n, ...), low-passed."""
         reach = min(self._reach, len(values) - 1)
         return np.asarray(scipy.signal.sosfiltfilt(self._sections, values, axis=0, padlen=reach))
 

@@ -1,4 +1,4 @@
-"""Is the simulation good enough? One object with the thesis's analysis, the paired one, and a verdict."""
+"""Comparison of simulation and hardware: the thesis's analysis, the paired one, and a verdict."""
 
 from __future__ import annotations
 
@@ -45,11 +45,12 @@ class Comparison:
     """The result of comparing simulation and hardware, of one run or several.
 
     Args:
-        own: Simulations under the thesis's own protocol (noise of their own); those of the pairs where there are none.
+        own: Simulations under the thesis's own protocol (noise of their own), else those of the pairs.
         verdict: Verdict on the paired comparison, or on the unpaired one where the disturbances differ.
-        tested: The runs that the verdicts rest on; the others are shown.
-        shared: What brought both to one clock: ``disturbance``, or of files ``reference``, ``input`` or ``motion``.
-        advice: What to do next where files do not allow a verdict; empty for what the tests say.
+        tested: Runs that the verdicts use; the others are only shown.
+        shared: Signal that brought both to one clock: ``disturbance``, or of files ``reference``, ``input``,
+            ``motion``.
+        advice: Next step where files do not allow a verdict; empty where the tests name one.
     """
 
     pairs: Sequence[Pair]
@@ -68,7 +69,7 @@ class Comparison:
 
     @property
     def notes(self) -> list[str]:
-        """Sentences for a reader of the figures: simulations that differ from their equation, and `left_out`."""
+        """Remarks on the figures: simulations that differ from their equation, and ``left_out``."""
         notes = []
         for run in (self.pairs[0].simulation, self.pairs[0].hardware):
             record = run_record(run.metadata)
@@ -81,17 +82,17 @@ class Comparison:
 
     @property
     def of_files(self) -> bool:
-        """Whether a side is a recording that says nothing of an experiment."""
+        """Whether a side is a recording without the record of an experiment."""
         return any(run.of_file or run.is_whole for pair in self.pairs for run in (pair.simulation, pair.hardware))
 
     @property
     def is_emulated(self) -> bool:
-        """Whether the hardware was emulated, in all runs."""
+        """Whether the hardware was emulated in all runs."""
         return all(is_emulated(pair.hardware) for pair in self.pairs)
 
     @property
     def what_of(self) -> str:
-        """Of what runs the intervals are, where runs may differ by more than their seeds, as text; else empty."""
+        """Runs that the intervals refer to, as text, where runs may differ by more than their seeds; else empty."""
         if not _may_differ([pair.hardware for pair in self.tested]):
             return ""
         if len(self.tested) == 1:
@@ -103,15 +104,12 @@ class Comparison:
 
     @property
     def hardware_name(self) -> str:
-        """What the simulation was compared with, as text."""
+        """Name of the other side, as text."""
         return "emulated hardware" if self.is_emulated else "hardware"
 
     @property
     def delay(self) -> float:
-        """Delay of the hardware's response: that of the test, else where the velocities correlate most [s].
-
-        NaN where the test finds no peak of likeness, and so no delay.
-        """
+        """Delay of the hardware's response [s], from the test or the velocities' correlation; NaN without a peak."""
         tested = next((test for test in self.verdict.tests if test.quantity == "delay"), None)
         if tested is None:
             return self.pairs[0].delay
@@ -138,18 +136,18 @@ class Comparison:
 
     @property
     def seen(self) -> str:
-        """Of what the spreads and distances of the tests are, as text: not of all samples, as those of a plant."""
+        """Samples that the spreads and distances of the tests use, as text."""
         times = "at the slower plant's sampling times and " if self.is_tested_in_pairs else ""
         return f"{times}below {self.band:.3g} Hz"
 
     @property
     def unlike_references(self) -> str:
-        """Why the moving references of a pair are not one, see :attr:`Pair.unlike_references`; empty where they are."""
+        """Why the moving references of a pair differ, see :attr:`Pair.unlike_references`; empty where they agree."""
         return next((pair.unlike_references for pair in self.pairs if pair.unlike_references), "")
 
     @cached_property
     def plants(self) -> dict[str, dict[str, Any]]:
-        """Figures of each plant over all samples of its runs, so that a run counts by their number, as in the tests."""
+        """Figures of each plant over all samples of its runs, weighted by their number as in the tests."""
         groups = {
             "sim": [pair.simulation for pair in self.pairs],
             "hw": [pair.hardware for pair in self.pairs],
@@ -226,13 +224,13 @@ def compare(
 
     Args:
         pairs: (simulation, hardware) of each run, at least one.
-        margin: What difference does not matter; see :meth:`Margins.parse`.
+        margin: Acceptable difference; see :meth:`Margins.parse`.
         looks: Number of interim analyses, where data are added until they decide.
-        shown: Runs, by their place among the pairs, that are shown and not tested; some other run is tested.
+        shown: Indices of pairs that are shown and not tested; some other run is tested.
         on_one_clock: As :meth:`Pair.of` takes it.
 
     Raises:
-        DataError: There is nothing to compare, or runs are given that must not be pooled.
+        DataError: There is nothing to compare, or the runs must not be pooled.
     """
     if not pairs:
         raise DataError("nothing to compare: 0 runs; expected at least 1 run with simulation and hardware")
@@ -265,7 +263,7 @@ def compare(
 
 
 def _may_differ(hardware_runs: Sequence[RunData]) -> bool:
-    """Return whether runs may differ by more than their seeds, as those of a machine, and those in real time."""
+    """Return whether runs may differ by more than their seeds, as on a machine or in real time."""
     return not all(is_emulated(run) and is_in_lockstep(run) for run in hardware_runs)
 
 
@@ -280,11 +278,7 @@ def compare_joints(
     margin: MarginArgument = None,
     looks: Looks | None = None,
 ) -> dict[str, Comparison]:
-    """Compare run folders, joint by joint, as :func:`compare_folders` does.
-
-    Args:
-        joints: Joints of plants of several; one empty name for plants of one.
-    """
+    """Compare run folders joint by joint; ``joints`` holds one empty name for plants of one joint."""
     with CachedBags() as bags:
         more: dict[str, Any] = {"margin": margin, "looks": looks, **({"open_bag": bags} if any(joints) else {})}
         return {joint: compare_folders(folders, joint=joint or None, **more) for joint in joints}
@@ -300,16 +294,16 @@ def compare_folders(
 ) -> Comparison:
     """Compare and pool run folders, each with ``sim``, ``hw``, and perhaps ``sim_500hz`` and repeats of the run.
 
-    Where there are repeats in lockstep, they alone are tested: in real time the loops of plant and controller have a
-    phase of their own in each run, which one run does not show. One that a busy machine disturbed is left out.
+    Repeats in lockstep, where there are any, are tested alone: in real time the loops of plant and controller have a
+    random phase in each run. Runs that a busy computer disturbed are left out.
 
     Args:
-        margin: What difference does not matter; see :meth:`Margins.parse`.
+        margin: Acceptable difference; see :meth:`Margins.parse`.
         looks: Number of interim analyses; by default that of the folders.
 
     Raises:
         BagError: A folder lacks one of its bags.
-        DataError: Runs are given that must not be pooled.
+        DataError: The runs must not be pooled.
     """
     margins = Margins.parse(margin)
     pairs: list[tuple[RunData, RunData]] = []
@@ -354,7 +348,6 @@ _PHASE = (
 
 
 def _in_words(stalls: Sequence[Mapping[str, str]]) -> str:
-    """Return that runs were aborted, and why: a fault of the bridge's own may look the same."""
     reasons = "; ".join(stall["reason"] + (f" (logs: {stall['logs']})" if stall["logs"] else "") for stall in stalls)
     runs, does, what = ("run", "does", "a standstill") if len(stalls) == 1 else ("runs", "do", "standstills")
     return (
@@ -383,7 +376,6 @@ _ROOTS_OF_SQUARES = ("rms_u", "rms_tracking_error")
 
 
 def _pool(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the figures of all runs as one: each sample has the same weight."""
     if len(rows) == 1:
         return dict(rows[0])
     counts = [row["samples"] for row in rows]
@@ -413,7 +405,7 @@ def _mean(values: Sequence[float], weights: Sequence[float]) -> float:
 
 
 def _pooled_std(spreads: Sequence[float], means: Sequence[float], counts: Sequence[int]) -> float:
-    """Return the standard deviation of all samples about their common mean, from those of the runs."""
+    """Return the standard deviation of all samples about their common mean."""
     middle = _mean(means, counts)
     squares = math.fsum(
         (count - 1) * spread**2 + count * (mean - middle) ** 2

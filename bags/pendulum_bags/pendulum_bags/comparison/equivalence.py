@@ -1,8 +1,7 @@
 """Equivalence tests against a stated margin: two one-sided tests, and their result as text.
 
-A test of "no difference" rewards little data. Two one-sided tests (Schuirmann, J. Pharmacokinet. Biopharm. 15, 1987)
-turn that round: equivalence is shown when the 90 % interval lies inside the margin, difference when it lies outside,
-and anything else is undecided, with the number of runs that would probably decide it.
+Two one-sided tests (Schuirmann, J. Pharmacokinet. Biopharm. 15, 1987): equivalent if the 90 % interval lies inside the
+margin, different if it lies outside, else undecided, with the number of runs that would probably decide.
 """
 
 from __future__ import annotations
@@ -40,8 +39,8 @@ class EquivalenceTest:
     Args:
         interval: Estimate with its interval; one of 90 % is two one-sided tests at 5 % each.
         low: Lower margin; minus infinity for a one-sided test.
-        more_runs: Runs to record in addition for a decision with 80 % probability; 0 where decided, None where more
-            runs would hardly help, since the estimate sits on the margin.
+        more_runs: Further runs for a decision with 80 % probability; 0 where decided, None where the estimate is at the
+            margin and more runs hardly help.
     """
 
     quantity: str
@@ -109,11 +108,10 @@ def equivalence_test(
     runs: int = 1,
     ratio: bool = False,
 ) -> EquivalenceTest:
-    """Test one quantity.
+    """Test one quantity; ``low`` is minus infinity for a one-sided test.
 
     Args:
-        low: Lower margin; minus infinity for one-sided.
-        outside: Interval that shows a difference where it lies beyond a margin; by default the same.
+        outside: Interval that shows a difference where it lies beyond a margin; by default ``interval``.
     """
     scale = _logarithm if ratio else float
     estimate, left, right = (scale(value) for value in (interval.estimate, interval.low, interval.high))
@@ -139,10 +137,7 @@ def _logarithm(value: float) -> float:
 
 
 def _runs_to_decide(estimate: float, bottom: float, top: float, error: float, runs: int, reach: float) -> int | None:
-    """Return how many more runs would decide with the stated power, if the estimate were the truth.
-
-    The error falls with the square root of the number of runs.
-    """
+    """Return the further runs that decide with the stated power if the estimate is true; errors fall as their root."""
     if not (math.isfinite(error) and math.isfinite(estimate)) or _power(estimate, bottom, top, 0.0, reach) < POWER:
         return None
     enough = next(
@@ -169,7 +164,6 @@ def _doubled(runs: int) -> Iterator[int]:
 
 
 def _power(estimate: float, bottom: float, top: float, error: float, reach: float) -> float:
-    """Return the probability that an interval with some standard error lies on one side of each margin."""
     inside, below, above = (estimate - bottom, top - estimate), bottom - estimate, estimate - top
     if error <= 0.0:
         return float(min(inside) > 0.0 or below > 0.0 or above > 0.0)
@@ -184,7 +178,7 @@ class Verdict:
 
     Args:
         outcome: Equivalent if all are, not equivalent if one is not, undecided otherwise.
-        more_runs: Runs to record in addition for a decision; 0 where decided, None where more hardly help.
+        more_runs: Further runs for a decision; 0 where decided, None where more hardly help.
     """
 
     outcome: Outcome
@@ -205,11 +199,7 @@ class Verdict:
 
 
 def conclude(tests: Sequence[EquivalenceTest], margins: Margins, first: str, second: str) -> Verdict:
-    """Return the verdict on a set of tests.
-
-    Args:
-        tests: At least one.
-    """
+    """Return the verdict on at least one test."""
     by_outcome = {outcome: [test for test in tests if test.outcome is outcome] for outcome in Outcome}
     different, undecided = by_outcome[Outcome.DIFFERENT], by_outcome[Outcome.UNDECIDED]
     whose = margins.whose

@@ -1,4 +1,4 @@
-"""Which runs may be pooled: independent recordings of one and the same experiment, and of nothing else."""
+"""Checks that pooled runs are independent recordings of the same experiment."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ _OF_THE_NOISE = ("kind", "amplitude", "hold_time")
 
 
 def check_pairs(pairs: Sequence[tuple[RunData, RunData]]) -> None:
-    """Refuse pairs of simulation and hardware that must not be compared, or not be pooled.
+    """Refuse pairs of simulation and hardware that must not be compared or pooled.
 
     Raises:
-        DataError: Simulation and hardware are swapped or had different controllers; one recording, or one seed, is
-            given twice; or runs differ in their controller, disturbance or plant.
+        DataError: The sides are swapped or had different controllers; a recording or a seed is repeated; or runs differ
+            in controller, disturbance or plant.
     """
     for simulation, hardware in pairs:
         _check_sides(simulation, hardware)
@@ -51,7 +51,7 @@ def check_pairs(pairs: Sequence[tuple[RunData, RunData]]) -> None:
 
 
 def check_clocks(runs: Sequence[RunData]) -> None:
-    """Refuse to pool runs in lockstep with runs in real time, where each has a phase of its own between its loops."""
+    """Refuse to pool runs in lockstep with runs in real time, whose loops have a random phase."""
     clocks = ["lockstep" if is_in_lockstep(run) else "real time" for run in runs]
     for clock, run in zip(clocks, runs, strict=True):
         if clock != clocks[0]:
@@ -80,7 +80,6 @@ def _check_sides(simulation: RunData, hardware: RunData) -> None:
 
 
 def _check_two(one: RunData, other: RunData) -> None:
-    """Refuse two runs of one side that are the same recording, or not of the same kind."""
     same_place = bool(one.source) and Path(one.source).resolve() == Path(other.source).resolve()
     a, b = one.window, other.window
     if same_place or (a.t.size == b.t.size and np.array_equal(a.position, b.position) and np.ptp(a.position) > 0.0):
@@ -133,7 +132,7 @@ def _value(key: str, value: Any) -> str:
 
 
 def _plain(value: Any) -> str:
-    """Return what values have in common that JSON, YAML and Python write differently."""
+    """Normalise values that JSON, YAML and Python write differently."""
     return json.dumps(_numbers(value), sort_keys=True)
 
 

@@ -1,14 +1,14 @@
 """Long-run variances from a short window: the response to the known disturbance is separated from the rest.
 
-The variance of a few seconds of motion misses the long-run one twice: it is taken about the window's own mean, and
-the disturbance of these seconds was larger or smaller than usual at the frequencies that the loop amplifies. Neither
-shows in a resampling of the window. Where the disturbance was recorded and is white, both are known:
+The variance over a few seconds of motion is biased: it is taken about the window's own mean, and the disturbance in the
+window was larger or smaller than usual where the loop amplifies. Resampling the window shows neither. Where the
+disturbance was recorded and is white, both are known:
 
     y(t) = c + b' z(t) + e(t),    var y = b' G b + var e
 
-with z the responses of simple modes to the disturbance, G their long-run covariance, which follows from the modes
-alone, and e what they do not explain. The decomposition is exact for any modes and any plant, linear or not, since e
-is orthogonal to z; better modes only leave less to e (a control variate: Owen, Monte Carlo theory, 2013, chapter 8).
+with z the responses of simple modes to the disturbance, G their long-run covariance, which follows from the modes, and
+e the residual. As e is orthogonal to z, the decomposition is exact for any modes and any plant; better modes only
+reduce e (a control variate: Owen, Monte Carlo theory, 2013, chapter 8).
 """
 
 from __future__ import annotations
@@ -41,12 +41,10 @@ _ORDER = 4
 
 @dataclass(frozen=True)
 class Disturbance:
-    """White noise that is held.
+    """White noise; each value is held for ``hold`` [s].
 
     Args:
         t: Times at which it takes a new value, shape (n,) [s].
-        value: Shape (n,).
-        hold: Time for which each value is held [s].
     """
 
     t: Array
@@ -55,12 +53,7 @@ class Disturbance:
 
     @classmethod
     def of(cls, signal: Signal | None, hold: float | None) -> Disturbance | None:
-        """Return the disturbance as recorded; None where it was not, or is not white.
-
-        Args:
-            signal: As recorded; the same value may be repeated.
-            hold: Time for which each value is held [s]; None if unknown.
-        """
+        """Return the recorded disturbance, held for ``hold`` [s]; None if missing, not white, or without ``hold``."""
         if signal is None or not hold:
             return None
         changes = np.concatenate(([0], 1 + np.flatnonzero(np.diff(signal.value))))
@@ -94,8 +87,7 @@ class Moments:
         gram: Long-run covariance of constant and modes under noise with a mean square of 1, shape (p, p).
         noise: Sums of squares of the noise over the blocks, shape (blocks,).
         known: Whether the disturbance explains the motion; else p is 1.
-        short: Correction of the motions for the bias of the window's own mean, from the independent samples that they
-            have; 1 where the disturbance is known; shape (q - p,).
+        short: Correction for the bias of the window's mean; 1 where the disturbance is known; shape (q - p,).
     """
 
     products: Array
@@ -111,7 +103,7 @@ def moments(clock: SlowClock, motions: Array, disturbance: Disturbance | None, b
 
     Args:
         motions: Band-limited, at the even times of the clock, shape (n, m).
-        disturbance: Its noise, on the same time axis; None where none is known.
+        disturbance: Its noise, on the same time axis, or None.
     """
     size = len(motions)
     modes, gram, squares = np.empty((size, 0)), np.empty((0, 0)), np.zeros(size)
@@ -174,10 +166,7 @@ def _modal(inputs: Array, poles: Array) -> Array:
 
 
 def _poles(clock: SlowClock, motions: Array, inputs: Array, slowest: float) -> Array:
-    """Return real poles, an octave apart, and the oscillating ones that the motions show.
-
-    Real poles alone fit an oscillation badly; a model of low order gives the frequencies.
-    """
+    """Return real poles, an octave apart, and from a model of low order the oscillating ones that the motions show."""
     period = clock.period
     octaves = np.arange(1 + math.floor(math.log2(max(2.0, 2.0 * slowest / period))))
     real = np.exp(-2.0 * 0.5**octaves)

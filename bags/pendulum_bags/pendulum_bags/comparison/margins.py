@@ -1,4 +1,4 @@
-"""What difference does not matter: stated by the user in units of the task, in one file."""
+"""Acceptable differences, stated by the user in units of the task, in one file."""
 
 from __future__ import annotations
 
@@ -49,12 +49,7 @@ _UNITS: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class Margin:
-    """One margin.
-
-    Args:
-        value: As stated, > 0.
-        unit: Its unit; ``%`` for a share of the hardware's own spread.
-    """
+    """One margin > 0 in its unit; ``%`` for a share of the hardware's own spread."""
 
     value: float
     unit: str
@@ -81,12 +76,12 @@ class Margin:
 
 @dataclass(frozen=True)
 class Margins:
-    """How much difference does not matter; a margin that is not given is that of ``margins.yaml`` of the package.
+    """Acceptable differences; a margin that is not given is that of ``margins.yaml`` of the package.
 
     Args:
-        spread_angle, spread_velocity, spread_torque: Difference of the standard deviations: in a unit, or as a share,
-            which allows factors from 1 / (1 + share) to 1 + share.
-        stated: Names of the margins that the user stated; the others are defaults, and the verdict reports it.
+        spread_angle, spread_velocity, spread_torque: Of the standard deviations: in a unit, or as a share, which allows
+            factors from 1 / (1 + share) to 1 + share.
+        stated: Names of the margins that the user stated; the verdict reports them.
     """
 
     mean_angle: Margin
@@ -109,7 +104,7 @@ class Margins:
                 ``delay=8 ms`` or ``spread_angle=0.2 deg``, or margins.
 
         Raises:
-            ParameterError: An unknown name, a unit of something else, or a value out of domain.
+            ParameterError: An unknown name, a unit of another quantity, or a value out of domain.
         """
         if isinstance(margin, Margins):
             return margin
@@ -129,31 +124,19 @@ class Margins:
 
     @classmethod
     def of(cls, file: Path | None, texts: Sequence[str] | None) -> Margins:
-        """Return the margins of a file, or the defaults, with those changed that stand in texts.
-
-        Args:
-            file: A margins file; None for the defaults.
-            texts: Such as ``delay=8 ms``; they win over the file.
-
-        Raises:
-            ParameterError: As :meth:`parse`.
-        """
+        """Return the margins of a file, or the defaults, overridden by texts such as ``delay=8 ms``."""
         base = cls.parse(file)
         stated = _parse_texts(texts or ())
         return replace(base, **stated, stated=base.stated | frozenset(stated))
 
     @classmethod
     def of_run(cls, folder: Path) -> Margins | None:
-        """Return the margins with which a run folder was last compared; None where it has none.
-
-        Raises:
-            ParameterError: The file is no margins file.
-        """
+        """Return the margins with which a run folder was last compared, or None; a ParameterError if damaged."""
         path = folder / _OF_RUN
         return cls.parse(path) if path.is_file() else None
 
     def keep(self, folder: Path) -> Path:
-        """Keep the stated margins in a run folder, as a margins file (JSON is YAML, too); return the file."""
+        """Store the stated margins in a run folder, as a margins file (JSON is YAML, too); return the file."""
         path = folder / _OF_RUN
         content = self.as_dict()
         write_json(path, {"format": FORMAT, "margins": {name: content[name] for name in sorted(self.stated)}})
@@ -161,7 +144,7 @@ class Margins:
 
     @property
     def whose(self) -> str:
-        """The source of these margins, as text."""
+        """Source of these margins, as text."""
         if not self.stated:
             return "the default margins (none were stated)"
         if all(name in self.stated for name in _UNITS):
@@ -179,11 +162,7 @@ class Margins:
 
     @classmethod
     def from_dict(cls, content: Mapping[str, Any]) -> Margins:
-        """Return margins from what :meth:`as_dict` gave.
-
-        Raises:
-            ParameterError: It is something else.
-        """
+        """Return margins from the output of :meth:`as_dict`, or raise a ParameterError."""
         stated = [name for name in content.get("stated", ()) if name in _UNITS]
         return cls.parse({name: f"{content[name]['value']} {content[name]['unit']}" for name in stated})
 
@@ -210,7 +189,6 @@ def _read(path: Path) -> dict[str, Margin]:
 
 
 def _margin(name: str, given: Any, where: str = "") -> Margin:
-    """Return a checked margin from a number, a text with or without unit, or a mapping of value and unit."""
     if name not in _UNITS:
         raise ParameterError(f"{where}margin has no {name!r}; expected one of {', '.join(_UNITS)}")
     unit = ""
@@ -239,7 +217,6 @@ def _margin(name: str, given: Any, where: str = "") -> Margin:
 
 
 def _parse_texts(texts: Sequence[str]) -> dict[str, Margin]:
-    """Return margins by their names, each of which is stated once."""
     stated: dict[str, Margin] = {}
     for name, margin in map(_parse_text, texts):
         if name in stated:

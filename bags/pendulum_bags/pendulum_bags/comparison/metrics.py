@@ -31,7 +31,7 @@ class Episode:
         error: Angle minus set-point, shape (n,) [rad].
         velocity: Shape (n,) [rad/s].
         effort: Torque of the controller, shape (n,) [N m].
-        step: Size of the step: angle at the start minus set-point [rad]; 0 for regulation.
+        step: Angle at the start minus set-point [rad]; 0 for regulation.
     """
 
     t: Array
@@ -80,10 +80,9 @@ def _settling_time(episode: Episode) -> float:
 
 
 def _smoothness(episode: Episode) -> float:
-    """Root mean square change of the torque within ``CHANGE_TIME``, per that time; small is smooth.
+    """Root mean square change of the torque within ``CHANGE_TIME``, per that time; NaN if samples are further apart.
 
-    A fixed time, not a sample: the change from sample to sample grows with the rate at which a plant is sampled. NaN
-    where the samples are further apart.
+    A fixed time makes it independent of the sampling rate.
     """
     t = episode.t
     if float(np.median(np.diff(t))) > CHANGE_TIME * (1.0 + 1e-6):

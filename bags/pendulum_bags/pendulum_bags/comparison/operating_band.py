@@ -19,12 +19,10 @@ _LEVEL = 0.95
 
 @dataclass(frozen=True)
 class Band:
-    """The band in which another run of a machine lies at each time with a probability of 95 %.
-
-    Prediction intervals by Student's t of the runs, at each time by itself.
+    """The band in which another run of a machine lies at each time with 95 % probability (Student's t of the runs).
 
     Attributes:
-        own: Mean of that share for each run of the machine, in the band of the others; NaN for fewer than three runs.
+        own: Mean share inside for each run of the machine, in the band of the others; NaN for fewer than three runs.
     """
 
     coverage: float

@@ -27,13 +27,7 @@ _ONE_REFERENCE = 0.05
 
 @dataclass(frozen=True)
 class Difference:
-    """Hardware minus simulation at common times.
-
-    Args:
-        t: Shape (n,) [s].
-        position: Shape (n,) [rad].
-        velocity: Shape (n,) [rad/s].
-    """
+    """Hardware minus simulation at common times ``t`` [s]: position [rad] and velocity [rad/s], shape (n,)."""
 
     t: Array
     position: Array
@@ -50,8 +44,8 @@ def interpolated_difference(simulation: Series, hardware: Series, *, at: str = "
     """Return the difference, with one motion interpolated by cubic splines at the other's stamps.
 
     Args:
-        at: ``simulation`` takes the simulation's stamps, as the thesis does; ``slower`` those of the motion with
-            fewer samples, so that no sample is counted that was never measured.
+        at: ``simulation`` for the simulation's stamps, as in the thesis; ``slower`` for those of the motion with fewer
+            samples, so that every sample was measured.
     """
     start, stop = shared_span(simulation, hardware)
     use_simulation = at == "simulation" or simulation.period > 1.01 * hardware.period
@@ -66,13 +60,10 @@ class Pair:
     """One run of simulation and hardware, compared.
 
     Args:
-        simulation, hardware: The runs.
         signal: The disturbances of both; None where they were not recorded.
         response: Alignment of the motions.
-        difference: As recorded.
-        aligned: After the response delay has been taken out of the hardware.
-        spectra: Spectra and coherence of the velocities.
-        on_one_clock: Whether another signal than a disturbance was found to be one and brought both to one clock.
+        aligned: Difference after the response delay has been taken out of the hardware.
+        on_one_clock: Whether a shared signal other than a disturbance brought both to one clock.
     """
 
     simulation: RunData
@@ -86,11 +77,7 @@ class Pair:
 
     @classmethod
     def of(cls, simulation: RunData, hardware: RunData, *, on_one_clock: bool = False) -> Pair:
-        """Compare two runs.
-
-        Raises:
-            DataError: A plant did not move, one of several joints fell, or the runs have too little in common.
-        """
+        """Compare two runs; a DataError if a plant did not move or fell, or the runs have too little in common."""
         for run in (simulation, hardware):
             if not np.ptp(run.window.position):
                 where = f" in {run.joint}" if run.joint else ""
@@ -157,10 +144,10 @@ class Pair:
 
     @property
     def unlike_references(self) -> str:
-        """Why both followed moving references that were not one under the noise; empty where they were, or none moved.
+        """Why two moving references differ under the noise; empty where they agree, or none moved.
 
-        The clock of a reference begins with its controller, that of the noise later: in real time not as much later
-        on both sides. Its motion then differs between runs of one plant, and by more than the plants may.
+        A reference starts with its controller and the noise later, in real time not equally later on both sides: then
+        runs of one plant differ by more than the plants may.
         """
         ours, theirs = self.simulation, self.hardware
         if not ours.follows_reference and not theirs.follows_reference:
@@ -204,7 +191,7 @@ class Pair:
 
 
 def _turned(hardware: RunData, simulation: RunData) -> RunData:
-    """Return the hardware's run moved by whole turns to where the simulation is: an angle is ambiguous by those."""
+    """Return the hardware's run shifted by whole turns to the simulation's: an angle is ambiguous by those."""
     if hardware.window.slides:
         return hardware
     turn = 2.0 * np.pi

@@ -1,13 +1,11 @@
-"""Compare recordings of which nothing is known but what is in them: what they share decides what may be said.
+"""Comparison of recordings without the record of an experiment: the signals that they share decide what is tested.
 
-Two runs are brought to one clock by a signal that both recorded: the disturbance, the reference, or the input; two free
-swings by the motion itself. Then:
+A signal that both recorded brings two runs to one clock: the disturbance, the reference, or the input; for two free
+swings the motion itself. Then:
 
-- a shared signal that acts throughout, on motions that go on alike, has the statistics of an experiment;
-- runs of a machine that were repeated are independent of each other: each quantity is taken from each run, and
-  Student's t of the runs gives its interval, for this input;
-- one run of each under an input that acts once is described and not judged: by how much the machine differs from itself
-  is not in the files.
+- a shared signal that acts throughout, on stationary motions, has the statistics of an experiment;
+- repeated runs of a machine are independent: each quantity comes from each run, with Student's t of the runs;
+- a single run of each under a transient input is described and not judged: the machine's own scatter is unknown.
 """
 
 from __future__ import annotations
@@ -68,8 +66,8 @@ class Shared:
 
     Attributes:
         kind: ``disturbance``, ``reference``, ``input`` or ``motion``; empty for nothing.
-        shift: By how much the second has to be moved to later [s].
-        why: Why it is no more, as text; empty where it is a signal.
+        shift: Shift of the second to later times [s].
+        why: Why there is no shared signal, as text; else empty.
         signals: The signal of each, on the clock of the first; of joints without one, too.
     """
 
@@ -97,13 +95,12 @@ def compare_runs(
         simulation: Recording of the simulation: a bag, or any other as a ``Reading``.
         hardware: Recording of the hardware; several of a run that was repeated.
         sim_prefix: Namespace of the simulation's topics; None for that of the bag's only plant.
-        margin: What difference does not matter; see :meth:`Margins.parse`.
-        joints: All joints, and their names in the hardware's recordings where those have others.
+        margin: Acceptable difference; see :meth:`Margins.parse`.
+        joints: All joints, and their names in the hardware's recordings where those differ.
 
     Raises:
         BagError: A bag cannot be read.
         DataError: A recording lacks states.
-        ParameterError: A margin is out of domain.
     """
     margins = Margins.parse(margin)
 
@@ -132,12 +129,10 @@ def compare_recordings(
     shared: Sequence[Shared] | None = None,
     margins: Margins | None = None,
 ) -> Comparison:
-    """Compare a simulation with one run of a machine, or with some that were repeated.
+    """Compare a simulation with at least one run of a machine.
 
     Args:
-        hardware: At least one run.
         shared: What each has in common with the simulation; None to find it.
-        margins: What difference does not matter; None for the defaults.
 
     Raises:
         DataError: There is nothing to compare, a plant did not move, or the recordings have no time in common.
@@ -220,7 +215,7 @@ _ADVICE = {
 
 
 def find_shared(simulation: Sequence[RunData], hardware: Sequence[RunData]) -> Shared:
-    """Return what two recordings have in common, and by how much the second has to be moved for it."""
+    """Return what two recordings have in common, and the shift of the second that aligns them."""
     reasons = []
     joints = list(zip(simulation, hardware, strict=True))
     for kind, signal in _SIGNALS.items():
@@ -262,7 +257,7 @@ def find_shared(simulation: Sequence[RunData], hardware: Sequence[RunData]) -> S
 
 
 def _unlike(kind: str, ours: Signal, theirs: Signal, correlation: float, period: float) -> str:
-    """Return why two signals on one clock are not one, as text; empty where they are."""
+    """Return why two signals on one clock differ, as text; empty where they agree."""
     if kind == _DISTURBANCE:
         found = compare_signals(ours, theirs, period)
         return "the disturbances are too short to be compared" if found is None else found.reason
@@ -280,9 +275,9 @@ def _unlike(kind: str, ours: Signal, theirs: Signal, correlation: float, period:
 
 
 def _best_shift(signals: Sequence[tuple[Signal, Signal]], ours: RunData, theirs: RunData) -> tuple[float, float]:
-    """Return by how much the second of each pair has to be later to be most like the first [s], and the correlation.
+    """Return the shift [s] of the second of each pair with the largest correlation, and that correlation.
 
-    The correlation is the mean over the pairs, of the samples that overlap: at least half of the shorter recording.
+    It is the mean over the pairs, over the overlapping samples: at least half of the shorter recording.
     """
     period = max(
         min(ours.window.period, theirs.window.period),
@@ -310,7 +305,6 @@ def _best_shift(signals: Sequence[tuple[Signal, Signal]], ours: RunData, theirs:
 
 
 def _correlations(a: Array, b: Array, reach: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Return the correlation coefficient of the samples that overlap, and their number, at each shift."""
     count = scipy.fft.next_fast_len(a.size + b.size)
     a, b = a - a.mean(), b - b.mean()
     ones = [np.fft.rfft(values, count) for values in (a, a * a, np.ones_like(a))]
@@ -353,13 +347,13 @@ def _on_one_clock(simulation: RunData, hardware: RunData, shared: Shared) -> tup
 
 
 def _has_one_input(*runs: RunData) -> bool:
-    """Return whether all runs have an input, in one unit: else their torques are no test."""
+    """Return whether all runs have an input, in one unit: else their torques are not tested."""
     has = all(run.applied is not None or np.any(run.window.effort) for run in runs)
     return has and len({run.window.effort_unit for run in runs}) == 1
 
 
 def _refuse_copies(runs: Sequence[RunData]) -> None:
-    """Refuse a recording that is given twice, in whatever format: it is like itself, and varies by nothing."""
+    """Refuse a recording that is given twice, in whatever format: it has no variance."""
     for index, run in enumerate(runs):
         for other in runs[:index]:
             if _is_copy(other.whole, run.whole):
@@ -372,9 +366,8 @@ def _refuse_copies(runs: Sequence[RunData]) -> None:
 def _is_copy(one: Series, other: Series) -> bool:
     """Return whether two recordings are one: the same rows, some of them, or points on the lines between them.
 
-    Another zero, another start of the clock and rows that were cut off make no other recording; two accurate
-    simulations differ by more. A copy that was filtered or rounded, or resampled by splines, is not seen, nor one that
-    was resampled and cut at both ends.
+    Another zero, start of the clock or cut is no other recording; two accurate simulations differ by more. A copy that
+    was filtered, rounded or resampled by splines is not detected, nor one resampled and cut at both ends.
     """
     if one.t.size == other.t.size and _same(one.position, other.position):
         return True
@@ -393,7 +386,7 @@ def _is_copy(one: Series, other: Series) -> bool:
 
 
 def _shifts_of_rows(a: Series, b: Series) -> Array:
-    """Return by how much the clock of b is behind that of a, where its rows of the fastest motion are rows within a."""
+    """Return the shifts of b's clock at which its rows of the fastest motion are rows within a."""
     steps, own = np.diff(a.position), np.diff(b.position)
     first = min(int(np.argmax(np.abs(own))), max(own.size - _ROWS, 0))
     own, error = own[first : first + _ROWS], _DIGITS * float(np.ptp(b.position))
@@ -405,12 +398,11 @@ def _shifts_of_rows(a: Series, b: Series) -> Array:
 
 
 def _same(one: Array, other: Array) -> bool:
-    """Return whether two signals that move are one, but for a constant."""
     return 0.0 != float(np.ptp(other)) * _DIGITS >= float(np.ptp(one - other))
 
 
 def _check_guesses(simulation: RunData, hardware: RunData, shared: Shared) -> None:
-    """Refuse a guess that takes one side's unit, zero or sign for another: it alone would make the verdict."""
+    """Refuse a guessed unit, zero or sign that exchanges the sides: it alone would decide the verdict."""
     a, b = simulation.window, hardware.window
     if not (simulation.guessed or hardware.guessed) or a.slides or b.slides:
         return
@@ -453,7 +445,7 @@ def _note(run: RunData, shared: Shared) -> str:
 
 
 def _goes_on(ours: RunData, theirs: RunData) -> bool:
-    """Return whether a signal acts throughout, and the motions are alike throughout: no transient, no drift."""
+    """Return whether a signal acts throughout on stationary motions: no transient, no drift."""
     for run in (ours, theirs):
         signal, window = run.disturbance, run.window
         assert signal is not None

@@ -1,14 +1,14 @@
 """Tests of the first layer: do simulation and hardware move alike under one controller and one disturbance?
 
-Estimands, each over a run without end under the same noise, both motions at the slower plant's sampling times and
-below one band: the difference of the means; the ratio of the standard deviations; the delay at which the simulation's
-velocity is nearest to the hardware's; the rms distance per standard deviation of the hardware, as it is and less that
-delay. Where runs differ by more than their seeds, as in real time, where each has a phase of its own between its loops,
-it is the mean over runs; of a single run, and for distances with the delay left in, it is that of these runs.
+Estimands, each over an endless run under the same noise, both motions at the slower plant's sampling times and
+band-limited: the difference of the means; the ratio of the standard deviations; the delay at which the simulation's
+velocity is nearest to the hardware's; the rms distance per standard deviation of the hardware, with and without that
+delay. Where runs differ by more than their seeds (real time: random phase between the loops), it is the mean over runs;
+of a single run, and for distances with the delay left in, it is that of these runs.
 
-The long-run variances are estimated by :mod:`pendulum_bags.comparison.long_run`, all intervals by a jackknife
-over blocks of time, with what is no matter of chance beside it: half a millisecond of the delay, and the
-correction for the window's own mean where the noise is not known. What the answers may err is in :class:`Looks`.
+Long-run variances are from :mod:`pendulum_bags.comparison.long_run`, all intervals from a jackknife over blocks of
+time, plus systematic errors: half a millisecond of the delay, and the correction for the window's own mean where the
+noise is not known. :class:`Looks` states the error rates.
 """
 
 from __future__ import annotations
@@ -63,14 +63,13 @@ Statistic = Callable[[Array, Array], Array]
 class Looks:
     """The number of interim analyses, and the share of the error that is left for this one.
 
-    The k-th analysis may err with probability alpha 2^-k on each side of a margin: over all analyses, for any number of
-    them and any stopping rule, that is at most alpha (union bound). Each should have about twice the data of the one
-    before, so that the wider intervals cost little: Student's quantile grows with the root of k, the error halves with
-    every second analysis.
+    The k-th analysis may err with probability alpha 2^-k on each side of a margin: at most alpha over all analyses, for
+    any stopping rule (union bound). Each should have about twice the data of the one before: Student's quantile grows
+    with the root of k, the error halves with every second analysis.
 
-    "Equivalent" needs each test's interval inside its margin, which errs with alpha at most whatever the number of
-    tests (Berger, Technometrics 24, 1982). One test suffices for "not equivalent", so each of nine has its share of
-    alpha (Bonferroni). Other layers of the verdict have errors of their own.
+    "Equivalent" needs each test's interval inside its margin, which errs with alpha at most for any number of tests
+    (Berger, Technometrics 24, 1982). One test suffices for "not equivalent", so each of nine has its share of alpha
+    (Bonferroni). Other layers of the verdict have errors of their own.
 
     Args:
         number: 1 for the first analysis; 0 where data are analysed once, and never added to.
@@ -103,11 +102,7 @@ class Looks:
 
 @dataclass(frozen=True)
 class _Kind:
-    """What all tests of some motions have in common.
-
-    Args:
-        driven: Whether any of them had a controller's torque: 0 and 0 are no test.
-    """
+    """What all tests of some motions have in common; ``driven`` if any had a controller's torque to test."""
 
     looks: Looks
     runs: int
@@ -155,11 +150,7 @@ def paired_tests(
     looks: Looks = Looks(),
     runs_differ: bool = True,
 ) -> list[EquivalenceTest]:
-    """Test all pairs together.
-
-    Args:
-        noises: The disturbance of each run on that clock, where it is white and known.
-    """
+    """Test all pairs together; ``noises`` are the white, known disturbances of the runs on their common clock."""
     band = min(common_band(margins.band.si, *pair) for pair in pairs)
     seen = [_Seen(*pair, band) for pair in pairs]
     kind = _Kind.of([one for pair in pairs for one in pair], margins, looks, len(pairs), runs_differ)
@@ -194,11 +185,7 @@ def unpaired_tests(
     looks: Looks = Looks(),
     runs_differ: bool = True,
 ) -> list[EquivalenceTest]:
-    """Test means and spreads of runs that share no disturbance, simulation and hardware each by itself.
-
-    Args:
-        noises: The disturbances of both, each on its motion's clock, where they are white and known.
-    """
+    """Test means and spreads of runs without a common disturbance; ``noises`` are the white, known ones of both."""
     band = common_band(margins.band.si, *simulations, *hardware)
     period = max(one.period for one in (*simulations, *hardware))
     sides = []
@@ -252,8 +239,8 @@ class _Seen:
     def lagged(self, lags: Array, *, sloped: bool = True) -> tuple[Array, Array, Array]:
         """Return the simulation's velocity earlier by each lag and its slope, shape (n, len(lags)), and the hardware's.
 
-        Where the simulation is the slower one, it is the hardware's that moves, the other way; the sides are exchanged.
-        The slope is that to the sample before: at the times at which the noise changes, the two sides of it differ.
+        Where the simulation is the slower one, the sides are exchanged. The slope is to the previous sample: it jumps
+        where the noise changes.
         """
         times = self.clock.times
         moving, still = (self.hardware, self.simulation) if self.is_slower else (self.simulation, self.hardware)
@@ -275,8 +262,7 @@ class _Run:
         spread: Long-run covariance of the motions; of all samples, then without each block, shape (1 + g, m, m).
         mean: Means of the motions, shape (1 + g, m).
         sizes: Samples of each of these, shape (1 + g,).
-        near: Covariance and mean within the window, with the delay as it is and as it might be too, shape (k, m, m)
-            and (k, m).
+        near: Covariance and mean within the window, at the delay and at its bounds, shape (k, m, m) and (k, m).
     """
 
     spread: Array
@@ -305,7 +291,7 @@ def _blocks(clock: SlowClock) -> int:
 
 
 def _jackknife(runs: Sequence[_Run], statistic: Statistic, kind: _Kind) -> Jackknife:
-    """Return a statistic of all runs together; a run counts by its samples."""
+    """Return a statistic of all runs together, weighted by their samples."""
     m = runs[0].mean.shape[-1]
     sums = [
         np.column_stack((run.spread.reshape(-1, m * m), run.mean, np.ones_like(run.sizes))) * run.sizes[:, None]
@@ -323,7 +309,7 @@ def _jackknife(runs: Sequence[_Run], statistic: Statistic, kind: _Kind) -> Jackk
 
 
 def _beside(runs: Sequence[_Run], statistic: Statistic, size: float) -> float:
-    """Return the error that is no matter of chance; ``size`` is what shares are of, 1 for a logarithm."""
+    """Return the systematic error; ``size`` is what shares are of, 1 for a logarithm."""
     values = [statistic(*run.near) for run in runs]
     late = float(np.mean([np.abs(one - one[0]).max() for one in values]))
     return late + size * (RESOLUTION + max(run.short for run in runs))
@@ -333,11 +319,9 @@ def _beside(runs: Sequence[_Run], statistic: Statistic, size: float) -> float:
 
 
 def _find_delay(seen: Sequence[_Seen]) -> float | None:
-    """Return the delay at which the velocities are most alike, over all runs, to a whole ``LAG_STEP`` [s].
+    """Return the delay at which the velocities of all runs are most alike, to a whole ``LAG_STEP`` [s].
 
-    Returns:
-        The delay; None where they are most alike at an end of the searched range, which is no peak, or where they are
-        hardly alike even there: for a delay beyond the range, the noise has small peaks.
+    None at an end of the searched range, or where they are hardly alike: beyond the range, noise has small peaks.
     """
     reach = LONGEST_DELAY - float(_LAGS[-1])
     # Below its band, a velocity changes little within a coarse step.
@@ -354,7 +338,6 @@ def _find_delay(seen: Sequence[_Seen]) -> float | None:
 
 
 def _likenesses(seen: Sequence[_Seen], lags: Array) -> tuple[Array, float]:
-    """Return the likeness of all runs at each lag [s], and the squares of what does not move."""
     products = squares = np.zeros(lags.size)
     power = 0.0
     for one in seen:
@@ -366,21 +349,18 @@ def _likenesses(seen: Sequence[_Seen], lags: Array) -> tuple[Array, float]:
 
 
 def _likeness(products: Array, squares: Array) -> Array:
-    """Return the correlation of two velocities at each lag, but for a factor that is the same at all."""
+    """Return the correlation of two velocities at each lag, up to a common factor."""
     return np.asarray(products / np.sqrt(np.maximum(squares, 1e-300)))
 
 
 def _lag(sums: Array) -> Array:
-    """Return the lag, from the middle one of ``_LAGS``, at which the distance of the velocities is smallest.
+    """Return the lag, from the middle one of ``_LAGS``, at which the velocities are nearest, shape (...).
 
-    There, what the scaled velocity leaves of the other is orthogonal to its slope. The distance itself would mislead:
-    where the slower plant samples as the noise changes, it rises faster on one side than on the other.
+    There the residual of the scaled velocity is orthogonal to its slope. The distance itself would mislead: where the
+    slower plant samples as the noise changes, it rises faster on one side.
 
     Args:
         sums: Of products, squares, slopes times the other velocity and slopes times the own, shape (..., 4, lags).
-
-    Returns:
-        Shape (...).
     """
     products, squares, crossed, own = (sums[..., i, :] for i in range(4))
     best = np.clip(np.argmax(_likeness(products, squares), axis=-1), 1, _LAGS.size - 2)
@@ -396,7 +376,7 @@ def _lag(sums: Array) -> Array:
 
 
 def _delay(seen: Sequence[_Seen], centre: float, kind: _Kind) -> tuple[Jackknife, list[float]]:
-    """Return the delay and what is taken out of each run [s]: where runs differ, its own, phase included."""
+    """Return the delay and what is taken out of each run [s]: its own, phase included, where runs differ."""
     parts, alone, sizes = [], [], []
     for one in seen:
         moving, slope, still = one.lagged(centre + _LAGS)
@@ -415,7 +395,7 @@ def _delay(seen: Sequence[_Seen], centre: float, kind: _Kind) -> tuple[Jackknife
 
 
 def _no_delay(margins: Margins, kind: _Kind) -> EquivalenceTest:
-    """Return the test of a delay that the motions do not show: anything in the searched range may be it."""
+    """Return the test of a delay that the motions do not show: any delay in the searched range is possible."""
     margin, scale = margins.delay, margins.delay.per_si
     end = scale * LONGEST_DELAY
     interval = Interval(math.nan, -end, end, kind.looks.level, math.nan, 1)
@@ -439,7 +419,7 @@ def _mean_test(
 def _difference(
     sides: Sequence[Sequence[_Run]], below: Statistic, above: Statistic, kind: _Kind, size: float = 1.0
 ) -> tuple[Jackknife, float]:
-    """Return what the hardware has more than the simulation, of pairs or of two sides, and the error beside chance."""
+    """Return hardware minus simulation, of pairs or of two sides, and the systematic error."""
     if len(sides) == 1:
 
         def both(spread: Array, mean: Array) -> Array:
@@ -452,7 +432,7 @@ def _difference(
 
 
 def _within(found: Jackknife, name: str, margin: Margin, kind: _Kind, beside: float = 0.0) -> EquivalenceTest:
-    """Test a statistic in SI units against a margin on both sides; it has an error ``beside`` that of chance."""
+    """Test a statistic in SI units against a margin on both sides; ``beside`` is its systematic error."""
     ends = -margin.value, margin.value
     return _test(found, name, margin.unit, ends, kind, lambda value: margin.per_si * value, beside=beside)
 
@@ -484,7 +464,7 @@ def _spread(column: int) -> Statistic:
 def _spread_tests(
     sides: Sequence[Sequence[_Run]], simulation: int, hardware: int, margins: Margins, kind: _Kind
 ) -> list[EquivalenceTest]:
-    """Test the spreads; angle, velocity and torque of the two sides begin at the columns given."""
+    """Test the spreads of angle, velocity and torque; ``simulation`` and ``hardware`` are their first columns."""
     tests = []
     for index, what in enumerate(_QUANTITIES):
         if what == "torque" and not kind.driven:
@@ -505,7 +485,6 @@ def _spread_tests(
 def _path_test(
     runs: Sequence[_Run], columns: tuple[int, int], what: str, margin: Margin, kind: _Kind
 ) -> EquivalenceTest:
-    """Test the distance of two motions, the simulation's and the hardware's."""
     a, b = columns
 
     def distance(spread: Array, mean: Array) -> Array:

@@ -27,8 +27,7 @@ class SharedSignal:
     """Two recorded disturbances compared.
 
     Args:
-        threshold: Correlation from which they count as one: independent signals that change as seldom exceed it with a
-            probability of ``CHANCE``.
+        threshold: Correlation that independent signals exceed at any lag with a probability of ``CHANCE``.
     """
 
     alignment: Alignment
@@ -64,11 +63,7 @@ class SharedSignal:
 
 
 def compare_signals(first: Signal | None, second: Signal | None, period: float) -> SharedSignal | None:
-    """Compare two recorded disturbances as functions of time since their start; None where one is missing.
-
-    Args:
-        period: Resolution of the lags [s].
-    """
+    """Compare two recorded disturbances over time since their start, at lags of ``period`` [s], or return None."""
     if first is None or second is None or min(first.t.size, second.t.size) < 12:
         return None
     alignment = align_signals(first, second, period)
@@ -83,7 +78,6 @@ def _changes(held: Signal) -> int:
 
 
 def _threshold(changes: int, duration: float) -> float:
-    """Return the correlation that independent signals exceed at any of the lags with a probability of ``CHANCE``."""
     if changes < 4:
         return 0.999
     # Lags within one hold are nearly one and the same trial.

@@ -41,13 +41,10 @@ class Spectra:
 
 
 def spectra_of(first: Series, second: Series, segment: float = 1.0) -> Spectra:
-    """Compare the velocities of two motions in frequency.
+    """Compare the velocities of two motions in frequency, up to half the slower rate.
 
-    Each density is estimated at (a multiple of) the rate of its own motion, and given up to half the slower rate. The
-    coherence needs common samples: the faster motion is brought to the slower rate behind an anti-alias filter.
-
-    Args:
-        segment: Length of a segment, halves overlapping [s]; shortened where fewer than four would fit.
+    Each density is estimated at (a multiple of) its own rate; for the coherence the faster motion is decimated behind
+    an anti-alias filter. ``segment`` is the length of a segment, halves overlapping [s]; shortened for fewer than four.
     """
     start, stop = shared_span(first, second)
     period = max(first.period, second.period)

@@ -1,7 +1,4 @@
-"""Statistics of correlated samples: description, block jackknife, Kolmogorov-Smirnov.
-
-Neighbouring samples of a motion are nearly equal. Every interval here therefore counts blocks, not samples.
-"""
+"""Statistics of correlated samples: moments, block jackknife, Kolmogorov-Smirnov. Intervals count blocks."""
 
 from __future__ import annotations
 
@@ -22,11 +19,7 @@ __all__ = ["Interval", "Jackknife", "KolmogorovSmirnov", "describe", "kolmogorov
 
 
 def describe(values: ArrayLike) -> dict[str, float]:
-    """Return count, mean, std, min, quartiles and max, under the names and definitions of ``pandas`` ``describe``.
-
-    Args:
-        values: Samples, shape (n,), n >= 2.
-    """
+    """Return count, mean, std, min, quartiles and max of values (n,), n >= 2, defined as in ``pandas`` ``describe``."""
     samples = np.asarray(values, dtype=float)
     if samples.size < 2:
         raise DataError(f"statistics of {samples.size} samples; expected at least 2")
@@ -73,7 +66,7 @@ class Jackknife:
     """An estimate with its standard error, from estimates that each lack one part of the data.
 
     Attributes:
-        between: The same estimate with the error that the runs show; None where they differ by chance alone.
+        between: The same estimate with the error between runs; None where they differ by chance alone.
     """
 
     estimate: float
@@ -86,8 +79,8 @@ class Jackknife:
     def of(cls, estimate: float, without: Array) -> Jackknife:
         """Return the delete-one-block jackknife (Quenouille, Biometrika 43, 1956; Tukey, Ann. Math. Stat. 29, 1958).
 
-        Neighbouring blocks that are alike add their correlation, as in the variance of a mean; the correlation rho of
-        few blocks is estimated too low by (1 + 4 rho) / g (Marriott, Pope, Biometrika 41, 1954), here for rho = 1/4.
+        Similar neighbouring blocks add their correlation, as in the variance of a mean; the correlation rho of few
+        blocks is estimated too low by (1 + 4 rho) / g (Marriott, Pope, Biometrika 41, 1954), here for rho = 1/4.
 
         Args:
             without: Estimates that each lack one block, in the order of time, shape (g,), g >= 2.
@@ -98,7 +91,7 @@ class Jackknife:
         return cls(estimate, math.sqrt(variance), blocks - 1.0, blocks)
 
     def of_runs(self, runs: Array, sizes: ArrayLike) -> Jackknife:
-        """Return the mean over runs that differ by more than chance, never surer than Student's t of the runs alone.
+        """Return the mean over runs, with an interval at least as wide as Student's t of the runs.
 
         Args:
             runs: Estimates from each run alone, shape (n,).
@@ -123,11 +116,7 @@ class Jackknife:
         return Jackknife(self.estimate - other.estimate, math.sqrt(total), freedom, blocks, between)
 
     def interval(self, level: float, scale: Callable[[float], float] = float, *, beside: float = 0.0) -> Interval:
-        """Return the interval by Student's t.
-
-        Args:
-            scale: Maps the estimate and the ends to the quantity reported, such as ``math.exp`` for a logarithm.
-        """
+        """Return the interval by Student's t; ``scale`` maps estimate and ends to what is reported (``math.exp``)."""
         reach = float(student_quantile(0.5 + 0.5 * level, self.freedom)) * self.error
         if self.between:
             # Phases are uniform and their effects skewed, of which Student's t misses up to four times what it states.
@@ -138,7 +127,7 @@ class Jackknife:
 
 
 class KolmogorovSmirnov(NamedTuple):
-    """Largest distance between two empirical distribution functions, with the samples that it really rests on.
+    """Largest distance between two empirical distribution functions.
 
     Attributes:
         distance: D, between 0 and 1.

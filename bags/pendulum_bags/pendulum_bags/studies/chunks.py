@@ -1,7 +1,7 @@
-"""Work in numbered pieces: here or on a Dask cluster, stored on disk, continued after an interruption.
+"""Work in numbered pieces: here or on a Dask cluster, stored on disk, resumed after an interruption.
 
-A piece is a pure function of a job and its number, so a result depends neither on the number of workers nor on the
-order in which they finish, and a worker that dies costs time only.
+A piece is a pure function of a job and its number: the result is independent of the workers, and a dead one costs time
+only.
 """
 
 from __future__ import annotations
@@ -47,14 +47,12 @@ def carry_out(
     missing: Iterable[int],
     connect: Connect = nullcontext,
 ) -> Iterator[tuple[int, Result]]:
-    """Yield number and result of each piece, in the order in which they are finished.
+    """Yield number and result of each piece as it finishes.
 
     Args:
-        task: Function of a module (a worker imports it) of the job, the number, and how many threads to take, None
-            for all.
-        job: What all pieces have in common; it travels to the workers.
-        connect: To a Dask cluster (`cluster_client`), not called where nothing is missing; by default one after the
-            other is carried out in this process.
+        task: Function of a module (a worker imports it) of the job, the number, and the threads to use, None for all.
+        job: What all pieces have in common; it is sent to the workers.
+        connect: To a Dask cluster (`cluster_client`), not called if nothing is missing; by default, this process.
 
     Raises:
         FaultError: The scheduler cannot be reached, or its workers keep dying.
@@ -79,15 +77,7 @@ def run_chunks(
     connect: Connect = nullcontext,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> None:
-    """Carry out the chunks that are not on disk yet, and write the columns of each to a file of its own.
-
-    Args:
-        folder: Where the files go.
-        task: Returns the columns of a chunk; else as in ``carry_out``, like ``job`` and ``connect``.
-
-    Raises:
-        FaultError: As ``carry_out``.
-    """
+    """Write the columns that ``task`` returns for each chunk not on disk to a file of its own; see ``carry_out``."""
     missing = [index for index in range(chunks) if not chunk_path(folder, index).is_file()]
     done = chunks - len(missing)
     on_progress(done, chunks)
@@ -104,11 +94,11 @@ def chunk_path(folder: Path, index: int) -> Path:
 
 @contextmanager
 def cluster_client(scheduler: str = "", workers: int = 0) -> Iterator[Any]:
-    """Connect to a Dask scheduler, or start a local cluster of single-threaded processes for as long as it is used.
+    """Connect to a Dask scheduler, or start a local cluster of single-threaded processes.
 
     Args:
         scheduler: Its address, ``tcp://HOST:PORT``; empty for none.
-        workers: Processes of a local cluster; 0 for none. With neither, what is yielded is None: this process.
+        workers: Processes of a local cluster; 0 for none. With neither, None is yielded: this process.
 
     Raises:
         ParameterError: Dask cannot be imported.
@@ -165,14 +155,7 @@ def _on_cluster(
 
 
 def open_results(folder: Path, what: str, fingerprint: str, settings: Mapping[str, Any]) -> None:
-    """Make the folder of results, or check that an existing one holds results of the same settings.
-
-    Args:
-        folder: Where the results go.
-
-    Raises:
-        BagError: The folder holds something else.
-    """
+    """Make the folder of results; a BagError if it exists with results of other settings."""
     marker = folder / _MARKER
     if marker.is_file():
         try:
@@ -221,11 +204,6 @@ def read_columns(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
 
 
 def _arrow() -> tuple[Any, Any]:
-    """Return pyarrow and its Parquet module.
-
-    Raises:
-        ParameterError: It cannot be imported.
-    """
     try:
         import pyarrow
         import pyarrow.parquet

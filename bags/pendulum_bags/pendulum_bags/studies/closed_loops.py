@@ -1,7 +1,6 @@
-"""Studies of many closed loops: a plant drawn from its uncertainty, held upright by its LQR, chunk by chunk.
+"""Studies of many closed loops: a plant drawn from its uncertainty, held upright by its LQR, in chunks.
 
-Chunk c draws from the stream (seed, c), so a result depends neither on the number of workers nor on the order in which
-they finish, bit for bit.
+Chunk c draws from the stream (seed, c), so results are bit-identical for any number of workers.
 """
 
 from __future__ import annotations
@@ -70,11 +69,7 @@ class ClosedLoops:
 
     @cached_property
     def nominal(self) -> PlantParameters:
-        """The nominal plant; pickled with the settings, since its file need not be where a worker runs.
-
-        Raises:
-            ParameterError: The plant is no rigid one.
-        """
+        """The nominal rigid plant; pickled with the settings, because a worker may not have its file."""
         plant = load_mechanism(self.plant)
         if plant.drivetrain is not None:
             raise ParameterError(
@@ -108,10 +103,7 @@ class ClosedLoops:
         return {name: value for name, value in found.items() if name not in others}
 
     def fingerprint(self) -> str:
-        """Return a hash of all that a chunk depends on.
-
-        A GPU's results differ by rounding, so that the device counts; the processor needs no mention.
-        """
+        """Return a hash of all that a chunk depends on; the device counts because a GPU rounds differently."""
         plant = self.nominal
         settings = {
             name: value

@@ -1,7 +1,4 @@
-"""Every controller on one board: swing-up and balance on each rigid plant, the public leaderboards' scores, robustness.
-
-A new controller is on the board as soon as it is in ``pendulum_lqr.controller_interface.controller.CONTROLLERS``.
-"""
+"""Swing-up and balance of every registered controller on each rigid plant: the public leaderboards' scores."""
 
 from __future__ import annotations
 
@@ -59,10 +56,7 @@ PATIENCE = 8.0
 
 @dataclass(frozen=True)
 class Cost:
-    """One cost of a run: weight and norm are those of the public leaderboard.
-
-    Source: reference scores of the dfki underactuated-robotics leaderboards (weights sum to 1).
-    """
+    """One cost of a run, with weight and norm of the dfki underactuated-robotics leaderboards (weights sum to 1)."""
 
     name: str
     unit: str
@@ -86,9 +80,9 @@ class Entry:
     """One line of the board.
 
     Attributes:
-        reason: Why it is not scored; empty where it is.
+        reason: Why it is not scored, or empty.
         scores: By version, v1 to v3.
-        wall: Time that the plain run took [s].
+        wall: Duration of the plain run [s].
         motion: Time [s], angle from upright [rad], applied torque [N m], thinned, shape (3, n); for plots.
     """
 
@@ -106,7 +100,7 @@ class Entry:
 def costs_of(arrays: RunArrays) -> tuple[bool, float, dict[str, float]]:
     """Return success, the share of time spent up, and the costs of a run.
 
-    ``time`` is when the pendulum enters the goal region for good, the length of the run where it never does.
+    ``time`` is when the pendulum enters the goal region for good, else the length of the run.
     """
     t = (arrays.stamp_ns - arrays.stamp_ns[0]) / NANOSECONDS
     duration = float(t[-1])
@@ -154,10 +148,7 @@ def model_errors(plant: PlantParameters) -> list[PlantParameters]:
 
 
 def push_trains(plant: PlantParameters, duration: float) -> list[dict[str, Any]]:
-    """Return disturbances that push once, when the pendulum is up, with shares of the largest torque.
-
-    The push comes after half of a run of ``duration`` [s], so that every run has it, and time to recover.
-    """
+    """Return disturbances that push once, after half of ``duration`` [s], with shares of the largest torque."""
     return [
         {
             "kind": "pulse_train",
@@ -202,7 +193,7 @@ def entry_of(
 
     Args:
         perturbed: Kind and runs of each perturbation; not evaluated where the plain run fails.
-        patience: Wall time of the plain run beyond which no perturbation is tried [s].
+        patience: Duration of the plain run beyond which no perturbation is tried [s].
     """
     began = time.perf_counter()
     try:
@@ -233,12 +224,7 @@ def evaluate(
     duration: float = 10.0,
     robustness: bool = True,
 ) -> Entry:
-    """Return the line of a controller: from hanging down to upright, on the plant that it was designed for.
-
-    Args:
-        parameters: Of the controller; by default its own.
-        duration: Length of each run [s].
-    """
+    """Return the line of a controller for ``duration`` [s] from hanging to upright, on its own plant."""
     true = load_plant(plant)
     # Hanging exactly down is an equilibrium that no torque of an energy controller leaves.
     spec: dict[str, Any] = {

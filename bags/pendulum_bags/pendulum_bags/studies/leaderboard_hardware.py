@@ -1,8 +1,7 @@
-"""The board's lines for the machine: the same nodes over the same DDS as on a real X5-9, here on the emulated one.
+"""The leaderboard for hardware: the nodes of a real X5-9, over DDS, with the emulated module.
 
-Each run has a ROS domain of its own and is in lockstep, so that a line is the same whenever it is computed; the
-programs stay loaded from one run to the next. A run in which the bridge faults (too fast, out of its window) is a
-failure with the bridge's own words.
+Each run is in lockstep in a ROS domain of its own, so results are reproducible; programs stay loaded between runs. A
+fault of the bridge is a failure with its reason.
 """
 
 from __future__ import annotations
@@ -36,11 +35,7 @@ _STRATEGY = "direct_pwm"
 
 
 def arrays_of_bag(bag: Path, namespace: str) -> RunArrays:
-    """Return a recorded run as the board's arrays.
-
-    Raises:
-        DataError: States and torques do not belong together.
-    """
+    """Return a recorded run as the board's arrays; a DataError if states and torques do not match."""
     with read_bag(bag) as opened:
         states = opened.array(f"{namespace}/{names.JOINT_STATES}")
         applied = opened.array(f"{namespace}/{names.APPLIED_EFFORT}")
@@ -82,13 +77,7 @@ def evaluate_hardware(
     robustness: bool = True,
     hosts: HostPool | None = None,
 ) -> Entry:
-    """Return the line of a controller on the emulated machine: from hanging down to upright, over DDS.
-
-    Args:
-        parameters: Of the controller; by default its own.
-        duration: Length of each run [s].
-        hosts: Run the programs; without them others do, which end with the line.
-    """
+    """Return the line of a controller for ``duration`` [s] from hanging to upright on the emulated machine."""
     spec: dict[str, Any] = {
         "side": "hw",
         "plant": _PLANT,
@@ -119,7 +108,7 @@ def _run(spec: RunSpec, hosts: HostPool) -> RunArrays:
 
 @contextmanager
 def _any_domain() -> Iterator[None]:
-    """Let a run find a free ROS domain, whatever other runs there are and whatever the user's is."""
+    """Let a run find a free ROS domain."""
     own = os.environ.pop("ROS_DOMAIN_ID", None)
     try:
         yield

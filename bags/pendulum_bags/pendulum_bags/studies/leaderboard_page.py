@@ -28,11 +28,7 @@ _ORDER = "v2"
 
 
 def write_page(path: Path, entries: Sequence[Entry], duration: float) -> Path:
-    """Write the page and return its path.
-
-    Args:
-        duration: Length of each run [s].
-    """
+    """Write the page for runs of ``duration`` [s] and return its path."""
     plants: dict[str, list[dict[str, Any]]] = {entry.plant: [] for entry in entries}
     for entry in sorted(entries, key=lambda one: -one.scores.get(_ORDER, -math.inf)):
         plants[entry.plant].append(_row(entry))

@@ -17,13 +17,11 @@ Trail = tuple[Any, ...]
 
 
 class LocatedMapping:
-    """A mapping from a YAML file with the lines of its keys.
+    """A mapping from the YAML file ``path`` with the lines of its keys.
 
     Args:
-        values: The mapping.
-        path: The file, for messages.
         lines: Line of each key, by the trail of keys and indices that leads to it.
-        trail: Where this mapping lies in the file.
+        trail: Location of this mapping in the file.
     """
 
     def __init__(self, values: Mapping[str, Any], path: Path, lines: Mapping[Trail, int], trail: Trail = ()) -> None:
@@ -34,11 +32,7 @@ class LocatedMapping:
 
     @classmethod
     def load(cls, path: Path, what: str) -> LocatedMapping:
-        """Read a file.
-
-        Raises:
-            ParameterError: It cannot be read, is no safe YAML, or holds no mapping.
-        """
+        """Read a file; a ParameterError if it cannot be read, is no safe YAML, or holds no mapping."""
         values = load_yaml(path, what)
         lines: dict[Trail, int] = {}
         # The strict loader has accepted this very text, so composing it again meets nothing unsafe.

@@ -1,12 +1,10 @@
 """The public double-pendulum benchmark: its criteria, its scores, its published rows.
 
-::
-
     score v2 = success (1 - mean over the criteria of tanh(pi criterion / norm))
     score v3 = seconds above the line / 60
 
-Up is a tip above nine tenths of the arms' length. Definitions, norms and rows of samples are those of the public
-implementation, to the letter, where paper and implementation differ too: its rows were computed by it.
+Up is a tip above nine tenths of the arms' length. Definitions, norms and rows follow the public implementation, also
+where it differs from the paper: it computed the rows.
 
 Sources: F. Wiebe et al., Open-source dual-purpose acrobot and pendubot platform, IEEE RAM 31(2), 2024; F. Wiebe et al.,
 Reinforcement learning for athletic intelligence, IJCAI 2024; github.com/dfki-ric-underactuated-lab/double_pendulum.
@@ -67,13 +65,7 @@ CRITERIA = (
 
 @dataclass(frozen=True)
 class Published:
-    """A row of the public boards.
-
-    Attributes:
-        score: Score v2; None where it is not on that board.
-        robustness: Overall robustness, v2.
-        uptime_score: Score v3, of 2025.
-    """
+    """A row of the public boards: score v2 (or None), overall robustness v2, and score v3 of 2025."""
 
     method: str
     plant: str
@@ -106,22 +98,14 @@ PUBLISHED = (
 
 
 def benchmark_plant(name: str) -> PlantParameters:
-    """Return the plant that the benchmark's boards simulate: design C.1 without friction and rotors, 6 N m.
-
-    Raises:
-        ParameterError: Another name.
-    """
+    """Return the plant that the benchmark's boards simulate: design C.1 without friction and rotors, 6 N m."""
     if name not in BENCHMARK_PLANTS:
         raise ParameterError(f"plant {name!r} is not in the benchmark; expected {' or '.join(BENCHMARK_PLANTS)}")
     return load_mechanism(f"{name}_frictionless")
 
 
 def is_above_line(plant: PlantParameters, states: Array) -> NDArray[np.bool_]:
-    """Return where the tip is above the line.
-
-    Args:
-        states: [shoulder, elbow, their velocities], shape (N, 4).
-    """
+    """Return whether the tip is above the line, for states [shoulder, elbow, their velocities], shape (N, 4)."""
     chain = in_arithmetic(plant.mechanism.chain, np)
     height = chain((states[:, 0], states[:, 1]), plant.packed)[-1][2]
     return np.asarray(height > line_height(plant), dtype=np.bool_)
@@ -135,8 +119,8 @@ def line_height(plant: PlantParameters) -> float:
 def criteria_of(plant: PlantParameters, times: Array, states: Array, efforts: Array) -> dict[str, float]:
     """Return the criteria of a recorded swing-up.
 
-    ``swingup_time`` is when the tip rises above the line for good, the last sample's time where it never does; like the
-    public implementation it ignores the first and the last sample.
+    ``swingup_time`` is when the tip rises above the line for good, else the last sample's time; like the public
+    implementation it ignores the first and the last sample.
 
     Args:
         times: Of the samples, shape (N,) [s].
@@ -162,12 +146,7 @@ def criteria_of(plant: PlantParameters, times: Array, states: Array, efforts: Ar
 
 
 def score_v2(criteria: Mapping[str, float], duration: float) -> float:
-    """Return the score of a swing-up, 0 where the tip was not up at the end.
-
-    Args:
-        criteria: Of :func:`criteria_of`.
-        duration: Time of the last sample [s].
-    """
+    """Return the score of a swing-up of ``duration`` [s], 0 where the tip was not up at the end."""
     if not criteria["swingup_time"] < duration:
         return 0.0
     share = sum(math.tanh(math.pi * criteria[one.name] / one.norm) for one in CRITERIA)

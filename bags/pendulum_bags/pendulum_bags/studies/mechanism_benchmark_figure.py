@@ -21,11 +21,7 @@ _APART = 1.4
 
 
 def write_swing_up_figure(path: Path, plant: PlantParameters, rows: Sequence[Row]) -> Path:
-    """Draw the best swing-up as a row of poses, and height and torque of all over time; return the path.
-
-    Args:
-        path: The picture; its suffix is the format.
-    """
+    """Draw the best swing-up as a row of poses, and height and torque of all over time; return the path."""
     from matplotlib.figure import Figure
 
     best = max(rows, key=lambda row: row.score)

@@ -1,9 +1,8 @@
 """Runs of the public double-pendulum benchmark: its simulation, its six robustness tests, its knock-downs.
 
-The public implementation's order within a step, of 2 ms: the measurement (delayed by whole steps, with noise), the
-command, what the motor makes of it (response, noise, limit), the kick, one step of Runge-Kutta. Friction there is
-``b v + c arctan(100 v)``; its robustness tests take b and c below zero too, which drives the joint. Where the plant has
-one motor its model multiplies efforts with a matrix that is zero at the passive joint: noise and kicks do not reach it.
+Order within a step of 2 ms, as in the public implementation: measurement (delayed by whole steps, with noise), command,
+motor (response, noise, limit), kick, one step of Runge-Kutta. Friction is ``b v + c arctan(100 v)``; its robustness
+tests also take b and c below zero, which drives the joint. Noise and kicks do not reach a passive joint.
 """
 
 from __future__ import annotations
@@ -102,7 +101,7 @@ class Trajectory(NamedTuple):
 
 @dataclass(frozen=True)
 class Disturbances:
-    """What is done to a run.
+    """Perturbations of a run.
 
     Attributes:
         values: Parameters of the plant that differ from the controller's model, by name.
@@ -111,7 +110,7 @@ class Disturbances:
         velocity_noise: Standard deviation of the noise on measured velocities [rad/s].
         torque_noise: Standard deviation of the noise on the motor's torque [N m].
         response: r in applied = last + r (commanded - last).
-        delay: Age of what is measured [s].
+        delay: Age of the measurement [s].
         kicks: Torque of each step on the driven joint, beyond the limit too; empty for none [N m].
     """
 
@@ -152,11 +151,7 @@ def _smooth_friction(v: Any, torque: Any, p: Any) -> Any:
 
 
 def make_stepper(plant: PlantParameters, *, compiled: bool = True) -> Stepper:
-    """Return ``(q, v, torque, p, coulomb) -> (q, v)`` after one step of the benchmark's simulation.
-
-    Args:
-        plant: A double pendulum; its own numbers do not matter.
-    """
+    """Return ``(q, v, torque, p, coulomb) -> (q, v)`` after one step of a double pendulum in the benchmark."""
     bare, along = plant.mechanism.forward, along_functions(2)
     step: Any = rk4_joints
     loaded: Any = _smooth_friction
@@ -197,8 +192,7 @@ def simulate(
         plant: The plant of the controller's model; differences from it are in ``disturbances``.
         stepper: Of :func:`make_stepper`.
         steps: Steps of 2 ms.
-        disturbances: None for none.
-        limits: Of both joints [N m]; none for the plant's own, 0 where it is passive.
+        limits: Of both joints [N m]; by default the plant's own, 0 where it is passive.
     """
     what = disturbances or Disturbances()
     true = plant.with_values(what.values) if what.values else plant
@@ -249,11 +243,7 @@ def swing_up(
 
 
 def robustness_trials(plant: PlantParameters, seed: int = 1) -> list[Trial]:
-    """Return the 722 runs of the six tests of robustness, each with a seed of its own.
-
-    Args:
-        seed: Of noise and kicks; the public implementation draws new ones each time.
-    """
+    """Return the 722 runs of the six tests of robustness, each with a seed of its own."""
     trials: list[Trial] = []
 
     def add(kind: str, level: str, disturbances: Disturbances) -> None:
@@ -317,8 +307,8 @@ def knock_downs(
 ) -> tuple[Trajectory, float]:
     """Return a run of 60 s with 15 knock-downs and its score v3, the share of time above the line.
 
-    At a random moment, about each 3.75 s, both joints get 6 N m for 0.2 s, and a PID with compensation of gravity
-    drives them to a random position.
+    About each 3.75 s, at random, both joints get 6 N m for 0.2 s, and a PID with gravity compensation drives them to a
+    random position.
     """
     controller.reset()
     rng = np.random.default_rng(seed)
@@ -331,7 +321,7 @@ def knock_downs(
 
 
 class _KnockDowns:
-    """The controller, interrupted: what the public tester of global policies does, its oddities included."""
+    """The interrupted controller, as in the public tester of global policies."""
 
     def __init__(self, plant: PlantParameters, controller: Controller, rng: np.random.Generator) -> None:
         self._answer = _answering(plant, controller)
@@ -391,7 +381,7 @@ def _answering(plant: PlantParameters, controller: Controller) -> Callable[[floa
 def _kicks(rng: np.random.Generator) -> tuple[float, ...]:
     """Return one profile on the driven joint: three bells of 0.5 to 5 N m, 0.05 to 0.1 s wide.
 
-    Drawn for six bells at least 1 s apart and shuffled between the joints, of which the passive one feels none.
+    Drawn as six bells at least 1 s apart, shuffled between both joints.
     """
     count, apart = 6, 1.0
     room = (DURATION - (count + 1) * apart) / count

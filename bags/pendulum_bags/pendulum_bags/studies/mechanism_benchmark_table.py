@@ -33,13 +33,7 @@ Job = tuple[str, str, int]
 
 @dataclass(frozen=True)
 class Row:
-    """What a controller reached.
-
-    Attributes:
-        score: Score v2.
-        robustness: Overall robustness, v2; None where it was not tested.
-        uptimes: Scores v3, one for each seed.
-    """
+    """Results of a controller: scores v2 and v3 (one for each seed), and overall robustness v2 or None if untested."""
 
     controller: str
     score: float

@@ -1,6 +1,6 @@
 """A million closed-loop runs over uncertain parameters, noise and starts; chunked, restartable, distributed.
 
-The noise of each run has a seed of its own. Runs can be added: a chunk is drawn whole, however many runs follow.
+The noise of each run has its own seed. Chunks are drawn whole, so runs can be added.
 """
 
 from __future__ import annotations
@@ -119,10 +119,7 @@ def _names(plant: PlantParameters) -> _Names:
 
 
 def draw_chunk(settings: MonteCarlo, index: int) -> Columns:
-    """Return what is drawn for a chunk: plants, starts and noise seeds.
-
-    A chunk is drawn whole and then cut, so that a run is the same however many follow it.
-    """
+    """Return plants, starts and noise seeds of a chunk, which is drawn whole and then cut."""
     plant, generator = settings.nominal, settings.generator(index)
     first = index * settings.chunk
     count = min(settings.chunk, settings.runs - first)
@@ -141,7 +138,7 @@ def run_chunk(settings: MonteCarlo, index: int, threads: int | None = None) -> C
 def _simulate(
     settings: MonteCarlo, drawn: Columns, threads: int | None = None, *, record: bool = False
 ) -> tuple[Columns, Array | None]:
-    """Run what was drawn; return all columns, and where it is to be recorded the motion, shape (steps, k, n)."""
+    """Run the drawn loops; return all columns, and the motion of one to record, shape (steps, k, n)."""
     plant, names = settings.nominal, _names(settings.nominal)
     result = simulate_batch(
         plant,
@@ -167,14 +164,7 @@ def _simulate(
 
 
 def replay(settings: MonteCarlo, number: int) -> tuple[dict[str, float], Array]:
-    """Run one run again, alone, and return what was drawn for it and its motion.
-
-    Args:
-        number: Of the run, from 0.
-
-    Returns:
-        The row of the table, and positions, velocities and efforts of all n joints at each step, shape (steps, 3 n).
-    """
+    """Repeat run ``number``, from 0; return its row and the motion of all joints (q, v, u), shape (steps, 3 n)."""
     if not 0 <= number < settings.runs:
         raise ParameterError(f"run is {number}; expected 0 to {settings.runs - 1}")
     index, place = divmod(number, settings.chunk)
@@ -191,10 +181,10 @@ def run_monte_carlo(
     connect: Connect = nullcontext,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
-    """Run all chunks that are not on disk yet, one Parquet file each, sum up and write that next to them.
+    """Run all chunks that are not on disk, one Parquet file each, and write the summary next to them.
 
     Args:
-        folder: Where the files go; a folder of the same settings is continued, one of fewer runs is added to.
+        folder: For the files; one of the same settings is continued, one of fewer runs extended.
         connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
 
     Raises:
@@ -220,7 +210,7 @@ def run_monte_carlo(
 
 
 def _figures(folder: Path, settings: MonteCarlo) -> dict[str, Any]:
-    """Return the probability of staying inside the bound, quantiles and the worst runs, from the Parquet files."""
+    """Return probability, quantiles and worst runs from the Parquet files."""
     coordinates, names = settings.nominal.coordinates, _names(settings.nominal)
     joints = [joint.unit for joint in coordinates.joints]
     units = dict(zip((*names.farthest, *names.spread), 2 * joints, strict=True))
@@ -256,9 +246,7 @@ def _figures(folder: Path, settings: MonteCarlo) -> dict[str, Any]:
 
 
 def sobol(settings: MonteCarlo, *, base: int = 4096) -> dict[str, Any]:
-    """Return first-order and total Sobol indices of the spread of one joint over parameters, noise and start.
-
-    The indices are those of independent factors: a correlation of the parameters is left out here.
+    """Return first-order and total Sobol indices of one joint's spread over independent parameters, noise and start.
 
     Args:
         settings: Distributions and loop; ``runs`` is not used.

@@ -29,10 +29,7 @@ _RESAMPLES = 500
 
 
 def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the comparison as JSON: a row for each plant and controller, and a paired test for each plant.
-
-    Writes ``figures/pid_vs_lqr_*.png`` and ``.pdf``.
-    """
+    """Return a row for each plant and controller, and a paired test for each plant; write the figures."""
     records = _by_place(records)
     runs = {run.number: run for run in study.runs}
     responses: dict[tuple[str, str], list[Episode]] = {}
@@ -108,10 +105,7 @@ def _mean_response(episodes: Sequence[Episode]) -> dict[str, Any]:
 
 
 def _by_place(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the records with "plant" naming all that the controllers meet: a test, a mean, a pair is of one such.
-
-    Where the study varies nothing but plant, controller and seed, that is the plant's name.
-    """
+    """Return the records with "plant" naming all conditions that the controllers share, at least the plant."""
     axes = [
         axis
         for axis in ("disturbance", "set_point", "start")
@@ -132,7 +126,7 @@ def _condition(axis: str, value: object) -> str:
 
 
 def _paired(records: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Compare the controllers seed by seed: the same noise on both, so that its luck cancels."""
+    """Compare the controllers seed by seed, under the same noise."""
     values: dict[tuple[str, str], dict[tuple[int, int], Mapping[str, Any]]] = {}
     for record in records:
         if record["status"] == "done":

@@ -21,11 +21,7 @@ __all__ = ["analyse", "print_table"]
 
 
 def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the pooled comparison of the thesis's experiments, or the parameters of all identification experiments.
-
-    Args:
-        records: Of its runs; those that failed are left out.
-    """
+    """Return the pooled comparison of regulation experiments, or the parameters of all identification experiments."""
     done = {int(record["number"]) for record in records if record["status"] == "done"}
     runs = [(run, folder / "runs" / run.name / "run") for run in study.runs if run.number in done]
     if study.experiment == "thesis":
@@ -46,15 +42,11 @@ def analyse(folder: Path, study: Study, records: Sequence[Mapping[str, Any]]) ->
 
 
 def _number(value: float | None) -> float:
-    """Return a number of a result file, where null is NaN."""
     return math.nan if value is None else float(value)
 
 
 def _alike(runs: Sequence[tuple[StudyRun, Path]]) -> dict[tuple[str, ...], list[Path]]:
-    """Return the folders of runs that differ in their seed alone; a seed that was repeated counts once.
-
-    The same noise again is no independent run, and runs of other plants or controllers are of another question.
-    """
+    """Return the folders of runs that differ in their seed alone, each seed once."""
     groups: dict[tuple[str, ...], dict[Any, Path]] = {}
     for run, place in runs:
         kind = tuple(str(run.labels[axis]) for axis in ("plant", "controller", "disturbance"))

@@ -12,11 +12,7 @@ __all__ = ["region_sentence", "write_region_figure"]
 
 
 def write_region_figure(path: Path, result: RegionResult) -> Path:
-    """Draw the map and return the path.
-
-    Args:
-        path: The picture; its suffix is the format.
-    """
+    """Draw the map and return the path."""
     from matplotlib import patheffects
     from matplotlib.figure import Figure
     from matplotlib.lines import Line2D

@@ -1,8 +1,8 @@
-"""From which starts is upright reached under the torque limit, over the plant's uncertainty?
+"""Starts from which upright is reached under the torque limit, over the plant's uncertainty.
 
-A grid of starts over two positions or velocities, the others as upright at rest, run for many plants through the batch
-engine. Plant 0 is the nominal one. A region that the LQR attracts according to its model belongs inside: of one joint
-the ellipse of the linear analysis, proven; of several a section of the states that it catches, sampled.
+A grid of starts over two positions or velocities, the others as upright at rest, run for many plants in the batch
+engine; plant 0 is nominal. The region that the LQR's model attracts belongs inside: the proven ellipse of the linear
+analysis for one joint, a sampled section for several.
 """
 
 from __future__ import annotations
@@ -39,12 +39,7 @@ _TWO_PI = 2.0 * math.pi
 
 @dataclass(frozen=True)
 class Axis:
-    """One axis of the grid.
-
-    Attributes:
-        name: A joint, or a joint and ``_dot`` for its velocity.
-        index: Which of the states [positions, velocities] it is.
-    """
+    """One axis of the grid: a joint, or a joint and ``_dot``; ``index`` into [positions, velocities]."""
 
     name: str
     span: float
@@ -59,13 +54,11 @@ class RegionMap(ClosedLoops):
     Attributes:
         plants: Plants at each start, the nominal one first; 1 leaves the uncertainty out.
         points: Points along each axis of the grid; an odd number has upright at rest among them.
-        tolerance: Largest distance of a position from upright [rad or m] and of a velocity from rest at the end at
-            which upright is reached.
+        tolerance: Largest final distance from upright [rad or m] and from rest [rad/s or m/s] that counts as upright.
         effort_limit: Torque limit of one joint [N m]; 0 for the plant's own.
         angle_span: Half width of the grid of one joint about upright [rad].
         velocity_span: Its half width in velocity [rad/s].
-        axes: Names of the two axes of several joints, joints or ``JOINT_dot``; empty for the positions of the first
-            two.
+        axes: The two axes of several joints, joints or ``JOINT_dot``; empty for the positions of the first two.
         spans: Half widths of the grid along them [rad, m, rad/s or m/s].
     """
 
@@ -117,11 +110,7 @@ class RegionMap(ClosedLoops):
 
     @cached_property
     def both(self) -> tuple[Axis, Axis]:
-        """The two axes.
-
-        Raises:
-            ParameterError: There are not two, or one is no position or velocity of the plant.
-        """
+        """The two axes; a ParameterError unless there are two, each a position or velocity of the plant."""
         if self.is_of_one:
             return Axis("theta", self.angle_span, "rad", 0), Axis("theta_dot", self.velocity_span, "rad/s", 1)
         joints = self.nominal.coordinates.joints
@@ -156,7 +145,6 @@ class RegionMap(ClosedLoops):
 
 
 def _run_chunk(settings: RegionMap, index: int, threads: int | None) -> Columns:
-    """Run a chunk and return its columns."""
     plant, first = settings.nominal, index * settings.plants_of_chunk
     numbers = np.arange(first, min(first + settings.plants_of_chunk, settings.plants), dtype=np.int32)
     count = len(numbers)
@@ -205,10 +193,10 @@ def run_map(
     connect: Connect = nullcontext,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> RegionResult:
-    """Run what is not on disk yet, one Parquet file for each chunk, and write the map and its figures.
+    """Run the chunks that are not on disk, one Parquet file each, and write the map and its figures.
 
     Args:
-        folder: Where the files go; a folder of the same settings is continued.
+        folder: For the files; one of the same settings is continued.
         connect: To a Dask cluster (`cluster_client`); by default in this process, on all cores.
 
     Raises:
@@ -224,7 +212,6 @@ def run_map(
 
 
 def _map(folder: Path, settings: RegionMap) -> RegionResult:
-    """Return the map, from the Parquet files."""
     shape = (settings.points, settings.points)
     hits, turned = np.zeros(shape, dtype=np.int64), np.zeros(shape, dtype=np.int64)
     believed = np.zeros(shape, dtype=np.bool_)
@@ -262,7 +249,7 @@ def _map(folder: Path, settings: RegionMap) -> RegionResult:
 
 
 def _level(settings: RegionMap) -> float | None:
-    """Return c of the region x' S x <= c that the model says is attracted; None where none was found."""
+    """Return c of the region x' S x <= c that the model attracts, or None."""
     plant = settings.nominal
     if settings.is_of_one:
         return proven_level(plant, settings.gain, plant.effort_limit)
@@ -279,13 +266,12 @@ class RegionResult:
     Attributes:
         share: Share of the plants that reach upright, shape (second axis, first axis).
         believed: Whether the nominal plant does, same shape.
-        turned: Share of the plants of one joint that reach it after going round, same shape.
-        moving: Share of all runs of one joint that neither reached upright nor rest: a longer duration may decide
-            them.
-        level: c of the region x' S x <= c that the LQR attracts on a model without dry friction: of one joint proven
-            for the nominal plant, of several sampled; None where none was found.
-        section: Its boundary in the plane of the map, deviations from upright, shape (k, 2); empty without it.
-        counterexamples: Starts inside from which the nominal plant does not reach upright; 0 is right.
+        turned: Share of the plants of one joint that reach it after a whole turn, same shape.
+        moving: Share of runs of one joint that reached neither upright nor rest: a longer duration may decide them.
+        level: c of the region x' S x <= c that the LQR attracts without dry friction: proven for the nominal plant of
+            one joint, sampled for several; None if none was found.
+        section: Its boundary in the plane of the map, deviations from upright, shape (k, 2), or empty.
+        counterexamples: Starts inside from which the nominal plant does not reach upright; expected 0.
         share_inside: Share of all runs from inside that reach upright; NaN without such a start.
     """
 

@@ -56,10 +56,7 @@ class Group:
     failed: int
 
     def mean(self, metric: str) -> tuple[float, float, float]:
-        """Return mean and 95 % interval over the runs: of a number Student's t, of a share Wilson's.
-
-        NaN where nothing is finite, or a number has no interval because fewer than two are.
-        """
+        """Return mean and 95 % interval over the runs: Student's t for numbers, Wilson for shares; or NaN."""
         values = self.values[metric]
         if metric in SHARES:
             low, high = share_interval(int(values.sum()), values.size)
@@ -78,14 +75,7 @@ class Group:
 
 
 def episode_of_run(place: Path, spec: RunSpec) -> Episode:
-    """Return what the controller did in a run.
-
-    Args:
-        place: Folder of the run, with ``bag`` or ``run.npz``.
-
-    Raises:
-        DataError: There is neither, or it has no states.
-    """
+    """Return motion and torque of a run from its folder's ``bag`` or ``run.npz``, or raise a DataError."""
     if (place / "run.npz").is_file():
         with np.load(place / "run.npz") as arrays:
             stamps, position, velocity = arrays["stamp_ns"], arrays["position"], arrays["velocity"]
@@ -109,12 +99,12 @@ def episode_of_run(place: Path, spec: RunSpec) -> Episode:
 
 
 def write_outcome(place: Path, spec: RunSpec | None, labels: Mapping[str, Any], failure: str = "", **more: Any) -> str:
-    """Store how a run went as ``run.json`` in its folder; return why it failed, what cannot be read included.
+    """Store the outcome of a run as ``run.json`` in its folder; return the reason of a failure, also one of reading.
 
     Args:
         place: Folder of the run, with ``bag`` or ``run.npz``.
-        spec: The run, of which metrics are stored where it has one joint; None for none.
-        failure: Why it failed; empty where it did not.
+        spec: The run, of which metrics are stored where it has one joint, or None.
+        failure: Reason of its failure, or empty.
     """
     record: dict[str, Any] = {**more, "labels": dict(labels)}
     if not failure and spec is not None and spec.mechanism is None:

@@ -30,11 +30,7 @@ _LONGEST_EXTRA = 120.0
 
 @dataclass
 class StudyProgress:
-    """Where a study is.
-
-    Attributes:
-        remaining: Expected wall time until the end [s].
-    """
+    """Progress of a study; ``remaining`` is the expected time until its end [s]."""
 
     total: int
     done: int = 0
@@ -45,20 +41,20 @@ class StudyProgress:
 
 
 def default_workers(study: Study) -> int:
-    """Return how many runs to carry out at once: one where they keep the wall's time, else one more than cores.
+    """Return how many runs to carry out at once: one in real time, else one more than cores.
 
-    The nodes of a run wait for each other, and at its start and end for the middleware: one a core leaves a third idle.
+    The nodes of a run wait for each other and for the middleware: one run a core leaves a third idle.
     """
     return 1 if study.realtime or any(run.lab for run in study.runs) else 1 + (os.cpu_count() or 1)
 
 
 def open_study_folder(folder: Path, study: Study) -> Study:
-    """Make the folder of a study, or check that an existing one holds this study, or less of it.
+    """Make the folder of a study, or check that an existing one holds this study, or a part of it.
 
-    A study may grow: by seeds, repeats, plants or other entries of its file. Finished runs keep their numbers.
+    A study may grow by seeds, repeats, plants or other entries of its file; finished runs keep their numbers.
 
     Returns:
-        The study, with the numbers that its runs have in the folder.
+        The study, with the numbers of its runs in the folder.
 
     Raises:
         BagError: The folder holds something else, or runs that this study does not have.
@@ -83,10 +79,7 @@ def _write_study(folder: Path, study: Study) -> None:
 
 
 def _renumbered(runs: Sequence[StudyRun], known: Mapping[str, str], folder: Path) -> tuple[StudyRun, ...]:
-    """Give runs their numbers in a folder, and new runs the next ones.
-
-    A run is identified by its name without the number, and by its parts; repeats by their order.
-    """
+    """Give runs their numbers in a folder, by name, parts and order of repeats; new runs get the next ones."""
     numbers: dict[tuple[str, str], list[int]] = {}
     for name, fingerprint in sorted(known.items()):
         number, _, rest = name.partition("_")
@@ -116,17 +109,12 @@ def run_study(
     on_progress: Callable[[StudyProgress], None] = lambda _: None,
     before_machine: Callable[[StudyRun], None] = lambda _: None,
 ) -> StudyProgress:
-    """Carry out all runs of a study that have not been carried out.
+    """Carry out the remaining runs of a study in a folder of :func:`open_study_folder`; return the final progress.
 
     Args:
-        folder: As :func:`open_study_folder` made it.
-        study: The study, as :func:`open_study_folder` returned it.
-        retry_failed: Carry out again those that failed; else they stay failed.
+        retry_failed: Carry out failed runs again.
         before_machine: Called before each run that moves a real machine; what it raises ends the study, which resumes
-            from there when it is started again.
-
-    Returns:
-        Where the study is at the end.
+            from there when restarted.
     """
     progress = StudyProgress(len(study.runs))
     waiting: list[StudyRun] = []
@@ -239,7 +227,7 @@ def _simulate(run: StudyRun, place: Path) -> None:
 
 
 def _record(item: _Running, failure: str) -> str:
-    """Keep how a run went; return why it failed, what cannot be read included, or an empty string."""
+    """Store the outcome of a run; return the reason of a failure, also one of reading, or an empty string."""
     run = item.run
     return write_outcome(
         item.folder,
@@ -256,7 +244,7 @@ def _record(item: _Running, failure: str) -> str:
 
 
 class _Pace:
-    """Expected remaining time, corrected by how long runs really took."""
+    """Expected remaining time, corrected by measured durations."""
 
     def __init__(self, runs: list[StudyRun], workers: int) -> None:
         self._workers = max(1, min(workers, len(runs) or 1))

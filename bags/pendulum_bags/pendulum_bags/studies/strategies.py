@@ -30,13 +30,7 @@ _SETTLED = 0.5
 
 
 def analyse(folder: Path, study: Study) -> list[dict[str, Any]]:
-    """Return one row for each run: identified damping and inertia, spread, and the gap to the simulation.
-
-    Writes ``figures/strategies.png`` and ``.pdf``.
-
-    Args:
-        study: The study; its first plant of side ``sim`` is the simulation that the others are compared with.
-    """
+    """Return one row for each run: identified damping and inertia, spread, and the gap to the first simulated plant."""
     motions: dict[str, tuple[Array, Array]] = {}
     rows: list[dict[str, Any]] = []
     for run in study.runs:
@@ -65,7 +59,7 @@ def analyse(folder: Path, study: Study) -> list[dict[str, Any]]:
 def commanded_recording(bag_folder: Path, spec: RunSpec) -> Recording:
     """Return the motion of a run with the commanded torque of controller and disturbance as its input.
 
-    Not ``applied_effort``: what the actuator makes of the command is what the strategies differ in.
+    Not ``applied_effort``: the strategies differ in what the actuator makes of the command.
     """
     with read_bag(bag_folder) as bag:
         states = bag[f"{spec.namespace}/joint_states"]

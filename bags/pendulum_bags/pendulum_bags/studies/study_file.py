@@ -58,12 +58,12 @@ class StudyRun:
     """One cell of a study's matrix.
 
     Attributes:
-        number: From 1, in the order of the file; runs that a study was given later come behind those it had.
+        number: From 1, in the order of the file; added runs follow.
         labels: Name on each axis: plant, controller, disturbance, set_point, start, seed, repeat.
         spec: The run, for ``experiment: run``.
-        engine: ``nodes`` over DDS, or ``process``: the same pieces in one process.
+        engine: ``nodes`` over DDS, or ``process``: the same parts in one process.
         arguments: For other experiments: what follows ``python -m pendulum_bags experiment``, but ``--out``.
-        seconds: Expected wall time [s].
+        seconds: Expected duration [s].
     """
 
     number: int
@@ -107,7 +107,7 @@ class Study:
     """A study.
 
     Attributes:
-        experiment: What each cell is: ``run`` in lockstep, or one of the experiments with a name.
+        experiment: ``run`` in lockstep, or the name of an experiment.
         clock: ``lockstep``, as fast as possible, or ``realtime``.
     """
 
@@ -138,7 +138,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def _content(name: str) -> str:
-    """Return a hash of a file's content, nothing where a text is no file."""
+    """Return a hash of a file's content, or nothing if a text is no file."""
     try:
         status = Path(name).stat()
     except (OSError, ValueError):
@@ -161,13 +161,10 @@ def shipped_studies() -> dict[str, Path]:
 def load_study(
     source: str | Path, *, seeds: Sequence[int] | None = None, plants: Mapping[str, Mapping[str, str]] | None = None
 ) -> Study:
-    """Read a study file, or one of the shipped studies by name.
+    """Read a study file, or a shipped study by name; a ParameterError names file and line.
 
     Args:
-        plants: By side, entries that its plants get in place of the file's, such as ``{"sim": {"plant": "x5_9"}}``.
-
-    Raises:
-        ParameterError: The file is refused; the message has file and line.
+        plants: By side, entries that replace those of its plants, such as ``{"sim": {"plant": "x5_9"}}``.
     """
     shipped = shipped_studies()
     path = Path(source)
@@ -225,7 +222,7 @@ def _law(file: LocatedMapping, name: str, entry: LocatedMapping) -> tuple[str, d
 
 
 def _missing(file: LocatedMapping) -> dict[str, str]:
-    """Return the optional controllers whose library is not installed, each with the sentence that names it."""
+    """Return the optional controllers whose library is not installed, each with a sentence."""
     controllers = _axis(file, "controllers")
     found = {}
     for name in file.get("optional", list, [], "a list of controllers"):

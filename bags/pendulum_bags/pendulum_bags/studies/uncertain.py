@@ -40,7 +40,6 @@ class Uncertainty:
     Attributes:
         shares: Standard deviation of each parameter as a share of its value, 0 to 1; others are known.
         correlation: Of the parameters in the order of ``shares``; empty where they are independent.
-        source: Where this comes from, as text.
     """
 
     shares: Mapping[str, float] = field(default_factory=dict)
@@ -62,10 +61,10 @@ class Uncertainty:
                 raise ParameterError(f"uncertainty of {name!r} is unknown; expected one of {', '.join(names)}")
 
     def draw(self, plant: PlantParameters, count: int, generator: np.random.Generator) -> dict[str, Array]:
-        """Return values of all uncertain parameters, shape (count,) each; reproducible by the generator.
+        """Return log-normal values of all uncertain parameters, shape (count,) each; reproducible by the generator.
 
-        They are log-normal, for no mass is negative. Of one joint all of ``VARIED`` are drawn, so that a parameter more
-        leaves the others as they are; those of several joints are independent.
+        For one joint all of ``VARIED`` are drawn, so that a further parameter leaves the others unchanged; those of
+        several joints are independent.
         """
         self.check(plant)
         if plant.is_pendulum:
@@ -91,11 +90,7 @@ class Uncertainty:
         return found
 
     def scatter(self, plant: PlantParameters, normals: Array, *, correlated: bool) -> dict[str, Array]:
-        """Return pendulums for standard normal numbers of shape (len(VARIED), n): log-normal about the plant's values.
-
-        Args:
-            normals: One row for each of ``VARIED``.
-        """
+        """Return pendulums for standard normal numbers, shape (len(VARIED), n): log-normal about the plant's values."""
         factor, variances = self._factor(correlated=correlated)
         logarithms = np.zeros_like(normals)
         names = list(self.shares)
@@ -153,12 +148,11 @@ def parse_uncertainty(text: str, plant: str) -> Uncertainty:
     """Return the uncertainty that a text names.
 
     Args:
-        text: ``identified`` for what an identification left in the plant file; one share for all parameters, such as
-            ``0.05``; or ``NAME=SHARE,...``, such as ``inertia=0.3`` or ``cart_mass=0.1,pole.damping=0.5``. Empty for
-            none.
+        text: ``identified`` for the intervals in the plant file; one share for all parameters, such as ``0.05``; or
+            ``NAME=SHARE,...``, such as ``inertia=0.3`` or ``cart_mass=0.1,pole.damping=0.5``. Empty for none.
 
     Raises:
-        ParameterError: A name is none of the plant, a share is none, or the file has no intervals.
+        ParameterError: An unknown name, an invalid share, or a file without intervals.
     """
     if text.strip() == "identified":
         return uncertainty_of(plant)
@@ -184,12 +178,9 @@ def parse_uncertainty(text: str, plant: str) -> Uncertainty:
 
 
 def uncertainty_of(plant_file: str) -> Uncertainty:
-    """Return an identification's uncertainty, by the intervals of its plant file.
+    """Return an identification's uncertainty, by the intervals of its plant file, or raise a ParameterError.
 
-    Of one joint it is the covariance instead, where the JSON that ``identify --out`` wrote lies next to the file.
-
-    Raises:
-        ParameterError: The file has no intervals.
+    For one joint it is the covariance, if the JSON of ``identify --out`` lies next to the file.
     """
     plant, provenance = load_plant_file(plant_file)
     intervals = provenance.get("intervals", {}) if Path(plant_file).suffix else {}
