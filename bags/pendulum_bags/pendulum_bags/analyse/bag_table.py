@@ -1,7 +1,7 @@
-"""The same questions to many recordings: a row for each plant of each, one for each run folder; here or on a cluster.
+"""The same questions for many recordings: a row for each plant of each, one for each run folder; here or on a cluster.
 
-:data:`~pendulum_bags.analyse.questions.QUESTIONS` lists the questions. Each bag is a piece of its own: finished pieces
-survive an interruption, and are computed again only when the bag has changed.
+:data:`~pendulum_bags.analyse.questions.QUESTIONS` lists them. Results are stored per bag, and computed again only if
+the bag has changed.
 """
 
 from __future__ import annotations
@@ -43,11 +43,7 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Piece:
-    """One recording, or one run folder with the bags ``sim`` and ``hw``.
-
-    Attributes:
-        how: How a recording is read that is no bag of ours: mapping, topics, time between rows, beginning and end.
-    """
+    """One recording, or one run folder with the bags ``sim`` and ``hw``; ``how`` to read it if it is no bag."""
 
     name: str
     path: str
@@ -88,11 +84,7 @@ def program_hash() -> str:
 
 @dataclass(frozen=True)
 class Table:
-    """The results.
-
-    Attributes:
-        wall: Time that this call took [s].
-    """
+    """The results, and the time that this call took [s]."""
 
     bags: Sequence[Row]
     runs: Sequence[Row]
@@ -106,9 +98,9 @@ class Table:
 
 
 def find_pieces(folders: Sequence[Path], questions: Sequence[str], how: Reading | None = None) -> list[Piece]:
-    """Return every bag, and every run folder where a question needs them, below some folders, ordered by name.
+    """Return every bag, and every run folder if a question needs them, below some folders, ordered by name.
 
-    Recordings of other formats are taken where a folder has no bag, or where they are given themselves.
+    Recordings of other formats count if their folder has no bag, or if they are given themselves.
 
     Args:
         questions: Names of ``QUESTIONS``.
@@ -163,10 +155,9 @@ def analyse_bags(
     """Compute what is missing of every piece, and write ``bags.csv``, ``runs.csv`` and their JSON.
 
     Args:
-        folder: Where results and tables go; with results of some pieces, it is continued.
+        folder: For results and tables; existing results are continued.
         questions: Names of ``QUESTIONS``.
-        connect: To a Dask cluster (`cluster_client`) that sees the bags under the same paths; by default the pieces
-            run one after the other in this process.
+        connect: To a Dask cluster (`cluster_client`) with the bags under the same paths; by default this process.
     """
     began = time.monotonic()
     answers = folder / "answers"

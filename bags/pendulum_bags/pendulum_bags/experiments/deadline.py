@@ -25,10 +25,9 @@ def slowness() -> float:
 
 
 class Deadline:
-    """A wall time at which something has to be over.
+    """A wall time limit, ``seconds`` from now or infinite [s].
 
     Args:
-        seconds: From now on; infinite for never [s].
         reserve: Processor time that must be left at the end [s]; at most half of all.
         clock: Monotonic clock [s].
     """

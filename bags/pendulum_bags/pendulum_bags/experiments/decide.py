@@ -32,12 +32,11 @@ def decide(
     """Compare a run folder, and record repeats into it until the comparison is decided.
 
     Only an emulator or a simulation is repeated: a real machine moves only on its operator's command. Each interim
-    analysis spends a share of the total error, so stopping at a decision errs no more often than one analysis.
+    analysis spends a share of the total error.
 
     Args:
-        folder: Folder of the run, recorded; a repeat whose hardware recording exists already is used at once.
+        folder: Folder of the run; a repeat whose hardware recording exists already is used at once.
         deadline: Of the repeats; None for one analysis of the existing recordings.
-        joints: Joints of plants of several; else one without a name.
         on_repeat: Called with the number of a repeat and its duration of noise [s] before it is recorded.
     """
     if not settings.can_repeat or deadline is None:
@@ -70,7 +69,7 @@ def decide(
 
 
 def _is_decided(compared: Mapping[str, Comparison]) -> bool:
-    """Return whether more repeats would change nothing: one joint decides a no, all of them a yes."""
+    """Return whether more repeats are needless: one joint decides a no, all of them a yes."""
     outcomes = [one.verdict.outcome for one in compared.values()]
     decided = Outcome.DIFFERENT in outcomes or Outcome.UNDECIDED not in outcomes
     return decided or any(one.unlike_references for one in compared.values())

@@ -1,6 +1,6 @@
 """Play a designed excitation on a plant: torque through the disturbance node, while a controller commands zero.
 
-A plant applies torque only if a controller replies. A playback of zero torque replies during the run: however the run
+A plant applies torque only if a controller replies. Here a zero-torque playback replies during the run: when the run
 ends, the replies stop and the plant goes to zero torque by its own rules.
 """
 
@@ -93,10 +93,9 @@ def play_in_lockstep(
     design_plant: str,
     domain: int | None = None,
 ) -> Path:
-    """Start a simulator or an emulated actuator, play on it as fast as it replies, and record.
+    """Start a simulator (``sim``) or an emulated actuator (``hw``), play on it in lockstep, and record.
 
-    ``side`` is ``sim`` or ``hw``; ``noise`` is the standard deviation of the simulated angle sensor [rad] (the emulator
-    has its own); ``domain`` is None for any free one.
+    ``noise`` is the standard deviation of the simulated angle sensor [rad]; ``domain`` is None for any free one.
 
     Raises:
         BagError: The bag exists.
@@ -132,7 +131,7 @@ def play_in_lockstep(
 def play_on_running_plant(
     bag: Path, play: ExcitationPlay, namespace: str, *, arm: bool, domain: int | None = None
 ) -> Path:
-    """Play on a plant that runs already in ``namespace``, in real time, and record.
+    """Play on a running plant in ``namespace``, in real time, and record.
 
     ``arm`` arms it if necessary and disarms it at the end; the domain is by default ``ROS_DOMAIN_ID``, or 0.
 

@@ -119,10 +119,9 @@ class HostPool:
     def start(
         self, command: Sequence[str], *, environment: Mapping[str, str], log: Path, niceness: int = 0
     ) -> HostedProgram | None:
-        """Start a program of this project in an idle or new host of its kind; None for other commands.
+        """Start ``[sys.executable, "-m", PACKAGE, EXECUTABLE, ...]`` in an idle or new host; None for other commands.
 
-        The command is ``[sys.executable, "-m", PACKAGE, EXECUTABLE, ...]`` with its complete environment. Output is
-        appended to ``log``; ``niceness`` is priority to give away, or to take if negative and permitted.
+        ``environment`` is complete; output is appended to ``log``; ``niceness`` may be negative if permitted.
         """
         interpreter, flag, package, executable = [*command[:4], *[""] * (4 - len(command))]
         if interpreter != sys.executable or flag != "-m" or not package.startswith("pendulum_") or not executable:

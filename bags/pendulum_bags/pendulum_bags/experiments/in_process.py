@@ -30,7 +30,7 @@ __all__ = ["RunArrays", "simulate", "simulate_plant"]
 class RunArrays:
     """The content of the run's bag: n + 1 rows for n steps, but n of ``applied``.
 
-    A row is a number for a plant of one joint, else it has a value per joint, in ``command`` and ``applied`` per driven
+    A row is a number for a plant of one joint, else a value per joint, or for ``command`` and ``applied`` per driven
     joint.
 
     Attributes:
@@ -39,7 +39,7 @@ class RunArrays:
         velocity: [rad/s or m/s].
         effort: Measured efforts [N m or N].
         command: The controller's commands; NaN without one [N m or N].
-        disturbance: On the joint that has it [N m or N].
+        disturbance: On the disturbed joint [N m or N].
         applied: Efforts that acted from each state on [N m or N].
     """
 

@@ -149,7 +149,7 @@ def identified_names(plant: PlantParameters) -> list[str]:
 
 
 def surrogate_for(plant: PlantParameters, *, share: float, delay: float, seed: int) -> PlantParameters:
-    """Return a surrogate of a machine, with values as far off as an identification may leave them.
+    """Return a surrogate of a machine, with parameter errors as an identification may leave them.
 
     ``share`` is the largest relative error of a mass, length, inertia or friction, drawn uniformly; ``delay`` the
     transport delay of each motor [s]. A ParameterError if no plant has such values.
@@ -167,8 +167,8 @@ def surrogate_for(plant: PlantParameters, *, share: float, delay: float, seed: i
 def design_for(plant: PlantParameters) -> PlantParameters:
     """Return the plant of the LQR's design: dry friction F of passive joints as viscous friction b = F / v.
 
-    A linear model has no dry friction, and no motor compensates it at a passive joint: an LQR without a model of it
-    loses acrobot and pendubot as soon as they move. At the velocity v both have the same force.
+    A linear model has no dry friction, and no motor compensates it at a passive joint: without b, an LQR loses acrobot
+    and pendubot as soon as they move. At the velocity v both forces are equal.
     """
     driven = plant.coordinates.driven_names
     changes = {
@@ -215,10 +215,7 @@ def fall_time(plant: PlantParameters, stamps_ns: Array, position: Array) -> floa
 
 
 def require_upright(folder: Path, settings: JointSettings, stopped: str = "") -> None:
-    """Raise a FaultError on both sides' state if a plant fell in the recordings ``sim`` or ``hw``, or stopped.
-
-    ``stopped`` is why the machine stopped, or empty; a side without states has not fallen.
-    """
+    """Raise a FaultError if a plant fell in the recordings ``sim`` or ``hw``, or for the reason ``stopped``."""
     plant = load_mechanism(settings.plant)
     ends: dict[str, str] = {}
     for side, words in (("sim", "simulation"), ("hw", "emulated hardware")):

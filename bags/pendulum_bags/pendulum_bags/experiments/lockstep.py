@@ -107,7 +107,7 @@ def record_run(
     """Carry out one run over DDS, in lockstep or in real time, and record it.
 
     ``domain`` is None for any free one; ``on_wait`` is called while waiting; ``hosts`` run the programs of lockstep
-    runs one after the other, without them each is a process of its own.
+    runs.
 
     Raises:
         BagError: The bag exists.
@@ -169,7 +169,7 @@ def _has_reached(plant: PlantClient, end_ns: int) -> bool:
 
 
 def _wait_for_end(orchestrator: Orchestrator, plant: PlantClient, duration: float) -> None:
-    """Wait for the end of a run in lockstep, on a busy machine too, as long as it progresses."""
+    """Wait for the end of a run in lockstep, as long as it progresses."""
     orchestrator.wait_for("the first state", lambda: plant.is_heard or _is_finished(plant), START_TIMEOUT)
     plant.stop_watching()
     recorder, received = RecorderClient(orchestrator, plant.namespace), 0

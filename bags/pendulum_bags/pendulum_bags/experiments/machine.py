@@ -101,7 +101,7 @@ class Machine:
     def rests(self) -> bool:
         """Let no run begin before :meth:`resume`; return whether none is being recorded.
 
-        The program need not have stopped at the file: on a busy computer it may take minutes to start.
+        The program may start late: on a busy computer it takes minutes.
         """
         if self._child is None or self._child.process.poll() is not None:
             return True
@@ -119,7 +119,7 @@ class Machine:
 
         Raises:
             BudgetSpentError: It is not recorded by the deadline.
-            PlantStoppedError: The plant stopped, because its controller lost it.
+            PlantStoppedError: The plant stopped under its controller.
             FaultError: It could not be recorded, or not in time.
         """
         (run,) = (run for run in self.runs if run.bag == bag)

@@ -45,9 +45,7 @@ _T = TypeVar("_T")
 
 
 class Orchestrator:
-    """An rclpy context and node, spun only while waiting; Ctrl-C ends any wait at once.
-
-    Waiting and calling raise FaultError on a timeout.
+    """An rclpy context and node, spun only while waiting; Ctrl-C ends any wait, a timeout is a FaultError.
 
     Args:
         watch: Called between two slices of waiting; raises to end the experiment (a process has died).
@@ -94,7 +92,7 @@ class Orchestrator:
     def wait_for(self, what: str, predicate: Callable[[], _T], timeout: float, *, until: Future | None = None) -> _T:
         """Wait, at most ``timeout`` [s], until a predicate, evaluated between slices, holds; return its value.
 
-        ``what`` is named in the error; ``until`` ends a slice when done, so that the predicate is evaluated at once.
+        ``what`` is named in the error; ``until`` ends a slice early.
         """
         deadline = time.monotonic() + timeout
         while not (value := predicate()):
@@ -137,8 +135,7 @@ class PlantClient:
 
     Args:
         namespace: Namespace of the plant's topics, such as ``/sim``.
-        controller: Name of its controller's node, empty for none.
-        disturbance: Name of its disturbance's node, empty for none.
+        controller, disturbance: Names of their nodes, empty for none.
         watch: Subscribe to its states now; a plant in lockstep waits for its last listener, which may be this one.
     """
 
@@ -283,8 +280,7 @@ class PlantClient:
     def trajectory_finished(self) -> bool:
         """Return whether the last requested move has ended.
 
-        A PlantStoppedError if the plant faulted, was stopped or disarmed; a FaultError if it refused the move or is
-        silent.
+        A PlantStoppedError if the plant faulted, was stopped or disarmed; a FaultError if it refused or is silent.
         """
         self.check_alive()
         for event in self.events[self._finished_before :]:

@@ -73,11 +73,7 @@ class Child:
 
 @dataclass
 class ProcessSet:
-    """The programs of one run; leaving the context ends them all.
-
-    Args:
-        hosts: Processes that run programs one after the other; without them each has its own.
-    """
+    """The programs of one run; leaving the context ends them all. ``hosts`` run them; by default each has a process."""
 
     log_folder: Path
     environment: Mapping[str, str]
@@ -113,9 +109,7 @@ class ProcessSet:
         environment: Mapping[str, str] | None = None,
         alone: bool = False,
     ) -> Child:
-        """Start a command in a process group of its own, to which this process passes Ctrl-C in order.
-
-        If there are hosts and the command is a program of this project, one of them runs it.
+        """Start a command in a process group of its own, or in a host, and pass Ctrl-C to it in order.
 
         Args:
             ends_last: End it after all others: a recorder records their last messages.
@@ -210,7 +204,7 @@ def start_recorder(
     simulated: bool = False,
     priority: int = 0,
 ) -> Child:
-    """Start the recorder of all topics of one plant, as the node ``recorder`` in the plant's namespace.
+    """Start the recorder of one plant's topics as the node ``recorder`` in its namespace.
 
     ``metadata`` is a JSON file about the run; ``simulated`` time is the plant's; ``priority`` is real-time, 0 for none.
     """

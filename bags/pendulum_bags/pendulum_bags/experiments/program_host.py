@@ -1,9 +1,9 @@
 """A process that runs programs one after the other, so that a hundred runs load Python's modules once.
 
-Starting a node takes half a second of processor time, nearly all of it to load numpy, scipy and rclpy. ``python -m
-pendulum_bags.experiments.program_host DESCRIPTOR`` reads orders (JSON lines) from the socket of that number and writes
-a line when a program ends. A program has its own variables, folder, output, signals, ROS context and exit code. The
-host ends when its socket does; :mod:`pendulum_bags.experiments.host_pool` is the other side.
+Loading numpy, scipy and rclpy costs half a second of processor time per node. ``python -m
+pendulum_bags.experiments.program_host DESCRIPTOR`` reads orders (JSON lines) from that socket and writes a line when a
+program ends. A program has its own variables, folder, output, signals, ROS context and exit code. The host ends with
+its socket; :mod:`pendulum_bags.experiments.host_pool` is the other side.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def main() -> int:
 
 
 def _run(order: Mapping[str, Any], on_begin: Callable[[], None]) -> int:
-    """Run one program with its own variables, folder, output and signals; return its exit code."""
+    """Run one program; return its exit code."""
     os.environ.clear()
     os.environ.update(order["environment"])
     os.chdir(order["folder"])
@@ -102,7 +102,7 @@ def _write_to(log: Path) -> None:
 
 
 def _left_behind() -> bool:
-    """Return whether a program has left a thread of its own that blocks the process's end, or one of the middleware.
+    """Return whether a program left a thread that blocks the process's end, or one of the middleware.
 
     The middleware names its threads; Python's have the name of the process.
     """

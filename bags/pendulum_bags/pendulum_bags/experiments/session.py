@@ -74,9 +74,8 @@ class Session:
     ) -> None:
         """Close the bag of a run in lockstep when it is complete; a FaultError if messages were lost.
 
-        Messages of ending nodes are no part of the run. ``states`` is the number that the plant has published;
-        ``published_each_step`` are relative names of topics with a message per step, one fewer than states: what a
-        publisher sends before it has matched the recorder is lost, and a short run can be over by then.
+        ``states`` is the number of published states; ``published_each_step`` are relative names of topics with a
+        message per step, one fewer than states: what a publisher sends before it has matched the recorder is lost.
         """
         # The clock ticks once for each state, and no topic waits for another.
         expected = {f"{plant.namespace}/{names.JOINT_STATES}": states, names.CLOCK: states}
@@ -102,8 +101,7 @@ class Session:
     ) -> None:
         """Wait until every subscription of a run is on the graph, and the recorder's are matched.
 
-        ``listeners`` are the required subscriptions to each of the plant's topics, by relative name; ``clock`` if the
-        plant publishes simulated time, which is recorded too.
+        ``listeners``: required subscriptions by relative topic name; ``clock``: the plant publishes simulated time.
         """
         orchestrator, node = self.orchestrator, self.orchestrator.node
 
@@ -128,11 +126,8 @@ def conduct(
 ) -> Iterator[Session]:
     """Join the graph for one run, whose phases are the caller's; leaving it ends all programs, recorders last.
 
-    An abort disarms what the session drives, at once. ``on_wait`` is called while waiting; ``hosts`` is as for
-    :func:`pendulum_bags.experiments.lockstep.record_run`.
-
-    Raises:
-        FaultError: The folder cannot be made; or, out of any wait, a program ended by itself.
+    An abort disarms at once what the session drives. ``on_wait`` is called while waiting; a FaultError out of any wait
+    if a program ended by itself.
     """
     with (
         ProcessSet(logs, ros_environment(domain, logs), hosts) as processes,
@@ -147,10 +142,7 @@ def conduct(
 
 
 def start_loop(processes: ProcessSet, program: NodeProgram, priority: int, *, simulated: bool = False) -> Child:
-    """Start a node with deadlines, at real-time priority if permitted.
-
-    ``simulated`` time is the plant's: there are no deadlines, and other programs need not wait.
-    """
+    """Start a node with deadlines, at real-time priority if permitted and time is not ``simulated``."""
     if simulated:
         return processes.start_node(program)
     return processes.start_node(in_real_time(program, priority), niceness=LOOP_NICENESS)
@@ -164,10 +156,9 @@ def in_real_time(program: NodeProgram, priority: int) -> NodeProgram:
 
 
 def permitted(priority: int) -> int:
-    """Return a real-time priority, at most a plant's, or 0 if a plant's is not permitted.
+    """Return a real-time priority, at most a plant's, or 0 if a plant's is not permitted: nothing may preempt it.
 
-    All or none: a controller must not have priority over a plant without it. Also 0 if ``PENDULUM_NO_REALTIME`` is set:
-    several experiments on one computer would block each other, and other programs with deadlines.
+    Also 0 if ``PENDULUM_NO_REALTIME`` is set: several experiments on one computer would block each other.
     """
     if os.environ.get(NO_REALTIME):
         return 0

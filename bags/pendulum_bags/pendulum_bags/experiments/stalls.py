@@ -1,7 +1,7 @@
-"""A run that a stalled machine aborted is no result: it is reported, recorded, and repeated a few times.
+"""A run that a stalled computer aborted is no result: it is reported, recorded, and repeated a few times.
 
-If the machine stalls an emulator for longer than the bridge's timeout, the bridge must fault: it cannot rule out real
-hardware. A real machine is never restarted automatically.
+The bridge must fault if an emulator stalls beyond its timeout, because it cannot rule out real hardware. A real machine
+is never restarted automatically.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ def is_stall(error: FaultError) -> bool:
 
 
 def run_undisturbed(run: Callable[[], None], folder: Path, *, emulated: bool, tell: Callable[[str], None]) -> None:
-    """Carry out a run, and repeat it if the machine stalled.
+    """Carry out a run, and repeat it if the computer stalled.
 
     Args:
-        folder: The run's folder; logs and reason of a stalled run remain, for the result.
+        folder: The run's folder; logs and reason of a stalled run remain.
         emulated: Whether the hardware is emulated; a real machine moves only on its operator's command.
 
     Raises:
-        FaultError: It failed for another reason, or the machine stalled each time.
+        FaultError: It failed for another reason, or the computer stalled each time.
     """
     for attempt in range(1, ATTEMPTS + 1):
         try:

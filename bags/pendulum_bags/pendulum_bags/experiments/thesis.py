@@ -51,14 +51,10 @@ def run_thesis(
     """Run the experiment and leave the bags ``sim``, ``hw`` and ``sim_500hz`` in the folder.
 
     Args:
-        folder: The run's folder.
-        settings: What to run.
         domain: ROS domain, or None for any free one.
-        progress: Shows the phase.
-        leaving: Leaves the graph of a successful run, in which the middleware can hang for ever: close it when
-            everything is written.
+        leaving: Leaves the graph of a successful run, in which the middleware can hang: close it last.
         on_idle: Called when a ramp begins, which leaves the computer idle.
-        rests: Called until it returns that the work begun then has paused, before the noise.
+        rests: Polled until the background work has paused, before the noise.
 
     Raises:
         FaultError: A program ended, a plant refused or faulted; everything is at rest again.
@@ -85,7 +81,7 @@ def run_thesis(
 def _start(
     session: Session, folder: Path, settings: RegulationSettings
 ) -> tuple[tuple[PlantClient, PlantClient], list[Child]]:
-    """Start all programs; return both plants, and their recorders. Running plants are checked without commands."""
+    """Start all programs; return both plants, and their recorders."""
     orchestrator = session.orchestrator
     joined = {side: join(orchestrator, running) for side in SIDES if (running := settings.running(side)) is not None}
     recorders = []
@@ -172,7 +168,7 @@ def _noise_ended(plant: PlantClient) -> bool:
 
 
 def _simulate_own_protocol(folder: Path, settings: RegulationSettings) -> None:
-    """Simulate as the thesis did, with its own noise, a new sample every 2 ms, and without nodes."""
+    """Simulate as the thesis did: its own noise, a sample every 2 ms, no nodes."""
     foreign = settings.foreign
     hold_time = 0.002 if foreign is None else max(0.002, foreign.period)
     noise = replace(settings.noise, seed=settings.noise.seed + OWN_PROTOCOL_SEED_STEP, hold_time=hold_time)

@@ -166,7 +166,7 @@ def run_trials(
     """Run all trials, one bag each (``trial_1``, ...), and return the bags.
 
     ``domain`` is None for any free one; ``ask`` shows an operator prompt and returns on Enter. A FaultError if a
-    program ended, or the plant refused or faulted; the drive is then at rest.
+    program ended or the plant refused or faulted; the drive is then at rest.
     """
     bags = []
     with reserve_domain(domain) as reserved, open_pool() as hosts:

@@ -66,7 +66,7 @@ def write_figures(figures: Sequence[Figure], folder: Path, formats: Sequence[str
 
 
 def _write_aside(figures: Sequence[Figure], folder: Path, formats: Sequence[str]) -> None:
-    """Write figures in a process of their own; the parent ends it, so it ignores SIGINT."""
+    """Write figures in a process of their own, which ignores SIGINT."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         _write(figures, folder, formats)

@@ -41,10 +41,10 @@ NUMBERS = "frequency_response.json"
 
 
 def read_responses(paths: Sequence[Path | Reading]) -> tuple[list[MeasuredResponse], str, list[str]]:
-    """Return the measured responses of one or two recordings or of a folder with ``sim`` and ``hw``, and their plant.
+    """Return the responses of one or two recordings or of a folder with ``sim`` and ``hw``, and the designs' plant.
 
-    The simulation comes first; the plant is the one that controllers were designed on. A BagError if a bag cannot be
-    read, a DataError if it holds no excited plant or both are of one side.
+    The simulation comes first. A BagError if a bag cannot be read, a DataError if it holds no excited plant or both are
+    of one side.
     """
     readings = [Reading.of(path) for path in paths]
     if len(readings) == 1 and all((readings[0].path / side).is_dir() for side in ("sim", "hw")):
@@ -116,11 +116,11 @@ def analyse_responses(
     Args:
         designs: As for :func:`pendulum_bags.frequency_response.designs.certify_designs`.
         scaling: Units of the gap; None for the thesis's task, or for several joints those of the LQR weights.
-        margin: Gap between the plants that does not matter; None for 0.2, or for several joints the margin of the
-            plant's own LQR, which a smaller gap keeps stable.
+        margin: Acceptable gap between the plants; None for 0.2, or for several joints the margin of the plant's own
+            LQR.
 
     Raises:
-        ParameterError: A text is no design; or the plant has other joints than the responses, or several motors.
+        ParameterError: An invalid design; or the plant has other joints than the responses, or several motors.
         DataError: A policy file cannot be read.
     """
     by_label = {response.label: response for response in responses}
@@ -185,12 +185,12 @@ def analyse_machine(machine: Path, plant: str, designs: Sequence[str] = (), ran:
 
     Args:
         designs: As for :func:`pendulum_bags.frequency_response.designs.certify_designs`; by default those certified
-            with the measurement, or else the thesis's four combinations.
+            with the measurement, else the thesis's four combinations.
         ran: Policy files that ran in the recording, certified too unless ``designs`` are given.
 
     Raises:
         DataError: The file holds no response.
-        ParameterError: A text is no design.
+        ParameterError: An invalid design.
     """
     measured = replace(read_response(machine), label="hw")
     kept = _kept(machine)

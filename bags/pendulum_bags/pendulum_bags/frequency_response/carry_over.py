@@ -20,14 +20,13 @@ __all__ = ["carry_over", "layers_of"]
 def carry_over(
     comparison: Comparison, folders: Sequence[Path], machine: Path | None = None, designs: Sequence[str] = ()
 ) -> Analysis | None:
-    """Return the certificates of designs on the simulated plant for a comparison's machine, or None.
+    """Return the certificates of designs on the simulated plant for a comparison's machine, or None without a response.
 
-    The measured response is ``machine`` (file or folder), or in the first of ``folders`` that has one; without it the
-    result is None. ``designs`` are as for :func:`pendulum_bags.frequency_response.designs.certify_designs`.
+    The response is ``machine`` (file or folder), or that of the first of ``folders`` with one.
 
     Raises:
         DataError: Designs are given without a response, it cannot be read, or it is of another machine.
-        ParameterError: A text is no design.
+        ParameterError: An invalid design.
     """
     place = machine or find_machine(folders)
     if place is None:

@@ -93,8 +93,8 @@ def compare_responses(
 ) -> Difference:
     """Return the difference of simulation and hardware, at the sampling period of the second.
 
-    ``model`` of either converts the first to that period; ``scaling`` has the units of the gap. A DataError if they
-    share too few frequencies.
+    ``model`` of either converts the first; ``scaling`` has the units of the gap. A DataError for too few common
+    frequencies.
     """
     lines, one, spread_one, two, spread_two = _at_common_lines(first, second)
     moved = brought_to(one, model, lines, measured=first.period, period=second.period)
@@ -170,10 +170,7 @@ def _gain(ratio: Complex, relative: Array) -> Interval:
 
 
 def _slope(x: Array, y: Array, deviation: Array) -> Interval:
-    """Return the weighted slope of y over x through 0, for y with standard deviations ``deviation``, all shape (n,).
-
-    Differences of dynamics, which it does not model, widen its interval.
-    """
+    """Return the slope of y over x through 0, weighted by ``deviation``; unmodelled dynamics widen its interval."""
     weight = 1.0 / np.maximum(deviation, 1e-6) ** 2
     slope = float(np.sum(weight * x * y) / np.sum(weight * x**2))
     misfit = max(1.0, float(np.sum(weight * (y - slope * x) ** 2)) / max(1, x.size - 1))

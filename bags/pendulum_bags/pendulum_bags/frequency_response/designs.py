@@ -128,7 +128,7 @@ def certify_designs(
         period: Of the simulation [s], which may stabilise what the hardware's longer one cannot.
 
     Raises:
-        ParameterError: A text is no design, or a policy is not for the plant.
+        ParameterError: An invalid design, or a policy for another plant.
         DataError: A policy file cannot be read.
     """
     cost = plant.mechanism.weights[1]

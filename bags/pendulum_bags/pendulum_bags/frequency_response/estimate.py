@@ -1,13 +1,13 @@
 """The frequency response of a plant in closed loop, from a known excitation.
 
-Feedback correlates the torque with the plant's own noise, so output over torque is biased towards the inverse of the
-controller. The joint input-output estimate is not: it relates both to the excitation r, which is independent of noise,
+Feedback correlates the torque with the plant's noise, which biases output over torque towards the inverse of the
+controller. The joint input-output estimate is unbiased: it relates both to the excitation r, which is independent of
+noise,
 
     G = S_yr / S_ur
 
 A periodic excitation is averaged over its periods, without leakage; another is cut into windowed segments that overlap
-by half. The spread between blocks is noise and gives the confidence: ``|G_hat - G|^2 / deviation^2`` follows F(2, 2
-(blocks - 1)).
+by half. The spread between blocks gives the confidence: ``|G_hat - G|^2 / deviation^2`` follows F(2, 2 (blocks - 1)).
 
 Source: Ljung, System Identification, 2nd ed., 1999, section 13.5; Pintelon and Schoukens, System Identification: A
 Frequency Domain Approach, 2nd ed., 2012, sections 2.5 to 2.7 and 4.3 (distortion on lines that were not excited).

@@ -98,10 +98,7 @@ def same_plant(
 
 
 def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, longer: str = LONGER) -> LayerResult:
-    """Return layer 3: yes if all designs that the simulation does not reject carry over, no if one does not.
-
-    ``longer`` is the command to measure longer.
-    """
+    """Return layer 3: yes if all designs that the simulation accepts carry over; ``longer`` adds data."""
     profile = certifier.profile
     unstable = int(np.sum(np.linalg.eigvals(certifier.plant.A).real > _UNSTABLE))
     good = [design for design in designs if design.certified]
@@ -188,7 +185,7 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
 
 
 def _named(some: Sequence[DesignResult], count: int) -> str:
-    """Return a few designs by name, or the number of many: the table has them all."""
+    """Return a few designs by name, or the number of many."""
     return ", ".join(one.name for one in some) if len(some) <= _FEW else f"{len(some)} of {count} designs"
 
 

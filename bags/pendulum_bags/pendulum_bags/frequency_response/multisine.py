@@ -54,10 +54,7 @@ class Multisine:
         return ours, theirs
 
     def _of_joints(self, spec: RunSpec) -> RunSpec:
-        """Return a run of several joints, with the amplitude of its noise: a tenth of its motor's limit.
-
-        It runs an LQR, since a response is that of a linear loop, up to 100 Hz, where all presets' loops are small.
-        """
+        """Return a run of several joints under an LQR, and the noise amplitude: a tenth of its motor's limit."""
         disturbance = {
             "kind": "multisine",
             "joints": spec.disturbance["joints"],

@@ -69,9 +69,8 @@ def record_of_arrays(arrays: RunArrays, label: str, disturbance: Mapping[str, An
 def record_of_run(run: RunData) -> Record:
     """Return the record of a recorded plant while its disturbance acted.
 
-    Torques are held from stamp to stamp, so their mean over each interval of the raster is taken; angle and velocity
-    are interpolated where stamps jitter. A DataError if disturbance or applied torque were not recorded, or states are
-    missing for long.
+    Held torques are averaged over each interval of the raster; angle and velocity are interpolated where stamps jitter.
+    A DataError if disturbance or applied torque are missing, or states for long.
     """
     return _record(run, [run])
 
@@ -82,7 +81,6 @@ def record_of_joints(runs: Mapping[str, RunData], driven: str) -> Record:
 
 
 def _record(run: RunData, motions: Sequence[RunData]) -> Record:
-    """Return the record of motions under the torque of one of them; all are from the same messages."""
     # A reference that moves excites a loop as a disturbance does.
     followed = run.followed if run.followed is not None and np.ptp(run.followed.value) > 0.0 else None
     excitation = run.disturbance if run.disturbance is not None else followed
@@ -147,7 +145,6 @@ def _nominal_period(t: Array) -> float:
 
 
 def _held_mean(signal: Signal, raster: Array, period: float) -> Array:
-    """Return the mean of a held signal over [t, t + period) for each t of a raster."""
     # The integral of a held signal is piecewise linear; it starts at the first sample.
     knots = np.concatenate([signal.t, [max(signal.t[-1], raster[-1] + period) + period]])
     integral = np.concatenate([[0.0], np.cumsum(signal.value * np.diff(knots))])

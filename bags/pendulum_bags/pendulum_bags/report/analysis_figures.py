@@ -32,7 +32,7 @@ __all__ = [
 
 
 def _relative(test: EquivalenceTest) -> tuple[float, float, float]:
-    """Return estimate and interval in units of the margin, so that tests of all units share one axis."""
+    """Return estimate and interval in units of the margin."""
     interval = test.interval
     values = (interval.estimate, interval.low, interval.high)
     if not math.isfinite(test.low) or math.isclose(test.low, -test.high):
@@ -123,11 +123,7 @@ def alignment(data: ReportData) -> Figure:
 
 
 def spectrum_panels(result: Spectra, unit: str = "rad", of: str = "") -> list[Panel]:
-    """Return power spectra and coherence of both velocities.
-
-    Args:
-        of: Whose they are, for the titles, such as ``, elbow``.
-    """
+    """Return power spectra and coherence of both velocities; ``of`` ends the titles, such as ``, elbow``."""
     frequency = result.frequency[1:]
     return [
         Panel(

@@ -40,11 +40,7 @@ def animation_of(data: ReportData) -> dict[str, Any]:
 
 
 def joint_animation(comparisons: Mapping[str, Comparison], plant: str) -> dict[str, Any] | None:
-    """Return frames of both plants as points of their links [px].
-
-    Returns:
-        The frames and the factor of enlargement; None where the plant is not known here, or not all its joints are.
-    """
+    """Return frames of both plants as points of their links [px] and the enlargement, or None for an unknown plant."""
     try:
         parameters = load_mechanism(plant)
     except ParameterError:
@@ -83,5 +79,4 @@ def _chains(parameters: PlantParameters, positions: Array) -> Array:
 
 
 def _enlarged(largest: float) -> float:
-    """Return how many times a largest deviation is enlarged."""
     return min(max(1.0, float(np.floor(WIDEST_SWING / largest))), LARGEST_FACTOR)

@@ -35,9 +35,9 @@ class ReportData:
 
     Args:
         summary: Content of ``summary.json``.
-        trials: The thesis's identification experiments, where they were recorded.
-        answer: The sum of all layers that were measured; by default of the comparison alone.
-        certified: Which designs carry over to the hardware, where its frequency response was measured.
+        trials: The thesis's identification experiments, if recorded.
+        answer: The sum of all measured layers; by default of the comparison alone.
+        certified: Designs that carry over, if the hardware's frequency response was measured.
     """
 
     comparison: Comparison
@@ -74,7 +74,7 @@ class ReportData:
 def read_trials(folder: str | os.PathLike[str]) -> TrialSet:
     """Read the bags ``trial_1``, ``trial_2``, ... of a folder and regress them as the thesis does.
 
-    Staircases are distinguished from motions by hand by their holds.
+    The holds of a staircase distinguish it from motions by hand.
 
     Raises:
         BagError: A bag cannot be read.

@@ -18,11 +18,7 @@ __all__ = ["joint_differences", "joint_spectra", "joints_together"]
 
 
 def joints_together(comparisons: Mapping[str, Comparison]) -> Figure:
-    """Return position and velocity of each joint, and the effort of those that were driven.
-
-    Args:
-        comparisons: The comparison of each joint, at least one.
-    """
+    """Return position and velocity of each joint (at least one), and the effort of driven ones."""
     panels: list[Panel] = []
     spreads: list[str] = []
     for joint, comparison in comparisons.items():
@@ -50,11 +46,7 @@ def joints_together(comparisons: Mapping[str, Comparison]) -> Figure:
 
 
 def joint_differences(comparisons: Mapping[str, Comparison]) -> Figure | str:
-    """Return the difference of each joint's motion under one disturbance, as recorded and less its delay.
-
-    Args:
-        comparisons: The comparison of each joint, at least one.
-    """
+    """Return the difference of each joint's motion under one disturbance, with and without its delay."""
     panels: list[Panel] = []
     words: list[str] = []
     for joint, comparison in comparisons.items():
@@ -85,11 +77,7 @@ def joint_differences(comparisons: Mapping[str, Comparison]) -> Figure | str:
 
 
 def joint_spectra(comparisons: Mapping[str, Comparison]) -> Figure:
-    """Return power spectra and coherence of each joint's velocity.
-
-    Args:
-        comparisons: The comparison of each joint, at least one.
-    """
+    """Return power spectra and coherence of each joint's velocity."""
     panels: list[Panel] = []
     words: list[str] = []
     for joint, comparison in comparisons.items():

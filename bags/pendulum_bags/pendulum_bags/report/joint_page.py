@@ -28,11 +28,7 @@ _Shown = TypeVar("_Shown", Figure, Table)
 
 
 def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: str) -> Page:
-    """Return the page.
-
-    Args:
-        comparisons: The comparison of each joint, by its name, at least one.
-    """
+    """Return the page of the comparisons of at least one joint, by name."""
     first = next(iter(comparisons.values()))
     # The bag's metadata of its run hold for all joints.
     data = ReportData(first, {"seed": seed_of(first.pairs[0].simulation)}, answer=answer)
@@ -85,7 +81,6 @@ def _facts(comparisons: Mapping[str, Comparison]) -> list[tuple[str, str]]:
 
 
 def _motions(comparisons: Mapping[str, Comparison]) -> Table:
-    """Return spread and largest effort of each joint on both sides."""
     rows: list[tuple[str, ...]] = []
     for joint, comparison in comparisons.items():
         pair = comparison.pairs[0]

@@ -58,11 +58,11 @@ class Page:
     """The contents of a report.
 
     Attributes:
-        emulated: Whether the hardware was emulated; all texts name it so then.
-        provenance: Tables of where the data come from.
-        surrogate: The surrogate of the hardware where none was measured.
+        emulated: Whether the hardware was emulated; all texts then name it so.
+        provenance: Tables of data sources.
+        surrogate: The surrogate of the hardware, if none was measured.
         animation: Output of :func:`pendulum_bags.report.animation.animation_of`; None for no animation.
-        runs: How many runs there are; sections that show the first of several have a note.
+        runs: Number of runs; sections that show the first of several have a note.
     """
 
     title: str
@@ -185,7 +185,7 @@ def _without_mark(answer: Answer) -> str:
 
 
 def _noise_note(data: ReportData) -> str:
-    """Return how long each side held its noise, where that differs: it matters more than the plant."""
+    """Return how long each side held its noise, if different: that matters more than the plant."""
     hold = data.comparison.unpaired["noise_hold_time"]
     sim, hw = hold["sim"], hold["hw"]
     if not sim or not hw or abs(sim - hw) < 1e-6:

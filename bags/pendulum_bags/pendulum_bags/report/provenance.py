@@ -67,7 +67,7 @@ def provenance_table(data: ReportData) -> Table:
 
 
 def _runs(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
-    """Return the bags of every run; of several runs each run's seed, command, revision and versions too."""
+    """Return the bags of every run; for several also seed, command, revision and versions."""
     rows = []
     # That of the first run is listed already.
     commands = {"", str(run_record(pairs[0].simulation.metadata).get("command", ""))}
@@ -93,7 +93,6 @@ def _runs(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
 
 
 def _made_with(pair: Pair) -> str:
-    """Return with which software a run was recorded, for each side where they differ."""
     by_label = {}
     for one in (pair.simulation, pair.hardware):
         record = run_record(one.metadata)
@@ -111,7 +110,7 @@ def seed_of(run: RunData) -> str:
 
 
 def _occasion(data: ReportData) -> list[tuple[str, str]]:
-    """Return when, on which computers and by which command the first run was recorded, as far as its bags have it."""
+    """Return date, computers and command of the first run, as far as recorded."""
     rows = []
     if when := _began(data):
         rows.append(("recorded", f"{when:%Y-%m-%d %H:%M} UTC"))
@@ -200,11 +199,7 @@ def _setting(value: Any) -> str:
 
 
 def citation(version: str, revision: str, year: str = "n.d.") -> str:
-    """Return how to cite the software that made a report, in APA style, by CITATION.cff.
-
-    Args:
-        version: Of the software; empty where it is unknown.
-    """
+    """Return how to cite the software that made a report, in APA style, by CITATION.cff; ``version`` may be empty."""
     release = f" (version {version})" if version else ""
     return f"{_AUTHORS} ({year}). {_TITLE}{release} [Computer software]. Git revision {revision}. No DOI is assigned."
 
@@ -220,6 +215,6 @@ def _plant_in_words(plant: PlantParameters) -> str:
 
 
 def _short_path(path: str) -> str:
-    """Return run folder and bag, of a repeat what lies between: the rest of the path is private."""
+    """Return run folder and bag, with the repeat between them: the rest of the path is private."""
     parts = Path(path).parts
     return "/".join(parts[-4:] if parts[-3:-2] == (REPEATS,) else parts[-2:])

@@ -34,7 +34,6 @@ def make_tables(data: ReportData) -> list[Table]:
 
 
 def _is_further(result: LayerResult) -> bool:
-    """Return whether a layer was measured apart from the tests of the run, which have a table of their own."""
     return result.layer is not Layer.SAME_RUN and result.mark is not Mark.NOT_MEASURED and bool(result.evidence)
 
 
@@ -186,7 +185,6 @@ _RANDOM = ("uniform", "gaussian", "multisine", "prbs", "from_bag")
 
 
 def _metric_name(metric: str, *, noisy: bool) -> str:
-    """Return a metric's name as text; under noise nothing settles, so nothing is called steady."""
     return "mean error at the end" if noisy and metric == "steady_state_error" else metric.replace("_", " ")
 
 
@@ -236,7 +234,6 @@ def parameter_rows(specs: Sequence[ParameterSpec], values: object) -> list[tuple
 
 
 def _regression(trials: TrialSet) -> list[Table]:
-    """Return the regression table of an experiment, trial by trial, and its averaged coefficients."""
     result = trials.result
     first = result.kind == "inertia_damping"
     section = INERTIA if first else GRAVITY

@@ -44,18 +44,15 @@ def write_report(
     extend: Callable[[Page], Page] = lambda page: page,
     open_bag: OpenBag = read_bag,
 ) -> Path:
-    """Write ``report.html`` and ``figures/`` into a folder.
+    """Write ``report.html`` and ``figures/`` into a folder; return the page.
 
     Args:
-        run_folder: Where the report goes; also the run folder (``sim``, ``hw``, perhaps ``sim_500hz``) to read unless
-            ``comparison`` or ``folders`` is given.
+        run_folder: Target; also the run folder (``sim``, ``hw``, perhaps ``sim_500hz``) to read unless ``comparison``
+            or ``folders`` is given.
         summary: Content of ``summary.json``; by default that of the comparison.
         trials: Folders of the thesis's identification experiments, each with bags ``trial_1``, ``trial_2``, ...
         answer: The sum of all layers; by default of the comparison and of the run folder.
-        certified: Which designs carry over to the measured machine; by default by the run folder's response.
-
-    Returns:
-        Path of the page.
+        certified: Designs that carry over; by default from the run folder's response.
 
     Raises:
         BagError: A bag cannot be read or the folder not be written.
@@ -96,13 +93,7 @@ def write_joint_report(
     answer: Answer,
     extend: Callable[[Page], Page] = lambda page: page,
 ) -> Path:
-    """Write ``report.html`` and ``figures/`` of plants of several joints into a folder.
-
-    Args:
-        out: Where the report goes.
-
-    Returns:
-        Path of the page.
+    """Write ``report.html`` and ``figures/`` of plants of several joints into ``out``; return the page.
 
     Raises:
         BagError: The folder cannot be written.
@@ -112,7 +103,7 @@ def write_joint_report(
 
 
 def _save(out: Path, page: Page, formats: Sequence[str]) -> Path:
-    """Write the figures, then the page with the same figures for paper."""
+    """Write the figures, then the page with the figures for print."""
     figures = [name_in(figure, emulated=page.emulated) for figure in page.figures]
     # Paper has no scripts: a printed page has these pictures.
     drawn = write_figures(figures, out / "figures", formats)
@@ -124,7 +115,7 @@ def _save(out: Path, page: Page, formats: Sequence[str]) -> Path:
 
 
 def _for_paper(path: Path) -> bytes:
-    """Return a figure with as many colours as it needs: a quarter of its size, and no difference on paper."""
+    """Return a figure with a reduced palette: a quarter of the size."""
     from PIL import Image
 
     buffer = io.BytesIO()

@@ -23,9 +23,7 @@ _NS = 1e-9
 def read_bag_recording(
     path: str | Path, *, effort: str = "applied", namespace: str | None = None, swings_freely: bool = False
 ) -> Recording:
-    """Read position and velocity from ``joint_states`` and the input that belongs to them.
-
-    A bag without any effort is that of a pendulum that swings freely.
+    """Read position and velocity from ``joint_states`` and their input; without any effort, it is a free swing.
 
     Args:
         effort: ``applied``: topic ``applied_effort``, held until its next sample; ``measured``: the effort of
@@ -33,7 +31,7 @@ def read_bag_recording(
         namespace: For a bag with several plants, such as ``/sim``; by default the only one.
 
     Raises:
-        DataError: for a bag without joint states, several plants and no namespace, or too few samples.
+        DataError: No joint states, several plants and no namespace, or too few samples.
     """
     if effort not in {"applied", "measured"}:
         raise DataError(f"effort is {effort!r}; expected 'applied' or 'measured'")
@@ -89,10 +87,7 @@ def _recording(bag: Bag, path: str | Path, effort: str, namespace: str | None, s
 
 
 def cut_at_steps(bag: Bag, stamps: NDArray[np.int64], origin: int) -> NDArray[np.float64]:
-    """Return stamps in seconds since ``origin`` [ns].
-
-    Those behind each step of a clock are moved so far away that no window reaches across.
-    """
+    """Return stamps in seconds since ``origin`` [ns], with a long gap at each step of the clock."""
     times = (stamps - origin).astype(np.float64) * _NS
     gap = gap_length(times)
     for cut in bag.cuts_ns:

@@ -1,4 +1,4 @@
-"""Bags that stay open while several runs are read of them: what was read of a topic serves the next joint too."""
+"""Bags that stay open while several runs are read from them, so that decoded topics serve the next joint too."""
 
 from __future__ import annotations
 

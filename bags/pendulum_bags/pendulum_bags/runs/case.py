@@ -37,23 +37,14 @@ def plant_identity(plant: PlantParameters) -> str:
 
 @dataclass(frozen=True)
 class Case:
-    """The plants of a result.
-
-    Attributes:
-        simulation: Identity of the simulation; empty where its recordings do not have one.
-        hardware: Identity of the hardware, the strategy of its drive included; empty likewise.
-    """
+    """Identities of the simulation and of the hardware (with the strategy of its drive); empty if not recorded."""
 
     simulation: str = ""
     hardware: str = ""
 
     @classmethod
     def of(cls, simulation: Iterable[Mapping[str, Any]], hardware: Iterable[Mapping[str, Any]]) -> Case:
-        """Return the case of the records of runs on both sides.
-
-        Raises:
-            DataError: The runs of one side are of two plants.
-        """
+        """Return the case of the records of runs on both sides; a DataError if the runs of a side are of two plants."""
         sides = []
         for side, records in (("simulation", simulation), ("hardware", hardware)):
             found = sorted({str(record[IDENTITY]) for record in records if record.get(IDENTITY)})
@@ -63,14 +54,7 @@ class Case:
         return cls(*sides)
 
     def require_same(self, other: Case, where: str) -> None:
-        """Refuse a result of other plants; what is not known of one of them is not compared.
-
-        Args:
-            where: Where the result is kept, for the message.
-
-        Raises:
-            DataError: It has another simulation or other hardware.
-        """
+        """Raise a DataError for a result (stored at ``where``) of other plants; unknown identities are not compared."""
         for side, ours in asdict(self).items():
             theirs = getattr(other, side)
             if ours and theirs and ours != theirs:

@@ -11,11 +11,9 @@ __all__ = ["autocorrelation", "effective_size"]
 
 
 def autocorrelation(values: ArrayLike, mean: float | None = None) -> Array:
-    """Return the autocorrelation at lags 0 to n - 1 (biased estimate, which is positive definite), shape (n,).
+    """Return the autocorrelation of values (n,) at lags 0 to n - 1, biased and so positive definite, shape (n,).
 
-    Args:
-        values: Shape (n,).
-        mean: Their expectation, where it is known; None takes their own mean.
+    ``mean`` is their expectation where it is known; by default, their own mean.
     """
     samples = np.asarray(values, dtype=float)
     centred = samples - (samples.mean() if mean is None else mean)
@@ -31,12 +29,9 @@ def autocorrelation(values: ArrayLike, mean: float | None = None) -> Array:
 def effective_size(values: ArrayLike, beside: ArrayLike | None = None) -> float:
     """Return how many independent samples have the same variance of the mean: n / (1 + 2 sum of rho).
 
-    With a second series, independent of the first one, it is the variance of the sum of their products that counts, as
-    in a regression of residuals on a regressor: rho is then the product of both autocorrelations (Bayley, Hammersley,
-    J. R. Stat. Soc. Suppl. 8, 1946).
-
-    The sum ends where a pair of neighbouring autocorrelations stops being positive (Geyer, Statistical Science 7,
-    1992, section 3.3), so that the noise of far lags does not enter.
+    With a second, independent series it is the variance of the sum of their products, as in a regression: rho is the
+    product of both autocorrelations (Bayley, Hammersley, J. R. Stat. Soc. Suppl. 8, 1946). The sum ends where a pair of
+    neighbouring autocorrelations is no longer positive (Geyer, Statistical Science 7, 1992, section 3.3).
     """
     # A regression without intercept has residuals about zero: their mean is an error like any other.
     rho = autocorrelation(values) if beside is None else autocorrelation(values, 0.0) * autocorrelation(beside, 0.0)

@@ -55,17 +55,16 @@ class Recording:
     Args:
         time: Stamps of position and velocity, strictly increasing, shape (n,) [s].
         position: Joint angle, 0 hanging down, not wrapped, shape (n,) [rad].
-        velocity: Joint velocity, shape (n,) [rad/s], or None where it was not recorded.
-        input: What drives the joint, shape (n,), or (m,) where ``input_time`` is given; unit by ``input_kind``.
+        velocity: Joint velocity, shape (n,) [rad/s], or None.
+        input: Input of the joint, shape (n,), or (m,) where ``input_time`` is given; unit by ``input_kind``.
         input_kind: One of ``INPUT_KINDS``.
-        hold: ``zero`` where the input stays until its next sample (a command), ``linear`` where it varies
-            between samples (a measurement).
+        hold: ``zero`` if the input is held (a command), ``linear`` if it varies between samples (a measurement).
         input_time: Stamps of the input where they differ from ``time``, shape (m,) [s].
         enabled: Share of the time in which the drive is on, shape of ``input``, 0 or 1; None for always.
         meta: Provenance and constants of the rig: ``source``, ``mass`` [kg], ``length`` [m], ``kp``, ``vin`` [V].
 
     Raises:
-        DataError: on stamps that do not increase, on NaN, or on arrays that do not fit together.
+        DataError: Stamps that do not increase, NaN, or arrays that do not match.
     """
 
     time: Array
@@ -235,7 +234,7 @@ def gaps(recording: Recording) -> list[tuple[float, float]]:
 
 
 def _cut_at(recording: Recording, rows: NDArray[np.int64]) -> Recording:
-    """Return a recording of which what follows some samples is moved behind a gap."""
+    """Return a recording with gaps behind some samples."""
     gap = gap_length(recording.time)
     time, stamps = recording.time, recording.input_time
     for row in rows.tolist():
@@ -246,10 +245,7 @@ def _cut_at(recording: Recording, rows: NDArray[np.int64]) -> Recording:
 
 
 def _joints(time: Array, position: Array) -> NDArray[np.int64]:
-    """Return the samples behind which another recording seems to begin: angle and speed both jump.
-
-    Where the angle alone jumps, the sensor slipped: its zero is another then.
-    """
+    """Return the samples behind which angle and speed both jump, as in joined recordings (not in a slip)."""
     step, intervals = np.diff(position), np.diff(time)
     ordinary = 20.0 * float(np.quantile(np.abs(step), 0.99))
     rows = np.flatnonzero((intervals <= longest_step(time)) & (np.abs(step) > max(_LEAST_JUMP, ordinary)))
@@ -260,12 +256,12 @@ def _joints(time: Array, position: Array) -> NDArray[np.int64]:
 
 
 def unwrap(recording: Recording) -> Recording:
-    """Return the recording with a continuous angle, and how often it jumped by a turn as ``unwrapped`` in ``meta``.
+    """Return the recording with a continuous angle, and the number of whole turns removed as ``unwrapped`` in ``meta``.
 
-    Where the angle jumps once and stays there, as between two recordings that were joined, it is cut.
+    It is cut where the angle jumps once for good, as in joined recordings.
 
     Raises:
-        DataError: where the angle jumps by something else again and again, faster than any pendulum turns.
+        DataError: The angle jumps by something else again and again, faster than any pendulum turns.
     """
     position = recording.position
     jumps = np.abs(np.diff(position)) > np.pi
@@ -323,12 +319,11 @@ def distinct_names(recordings: Sequence[_Named]) -> list[str]:
 def check_consistency(recording: Recording) -> Recording:
     """Return the recording if its velocity is the derivative of its position, else name the likely unit.
 
-    The slope of travelled angle against integrated velocity is 1 in consistent units, 57.3 for degrees taken
-    as radians, and so on. Recordings that hardly move (less than 0.2 rad) are not judged, nor is what lies within a
-    gap: nobody knows how the pendulum moved there.
+    The slope of travelled angle against integrated velocity is 1 in consistent units, 57.3 for degrees taken as
+    radians. Recordings that move less than 0.2 rad are not judged, nor are gaps.
 
     Raises:
-        DataError: where the slope lies outside 0.5 to 2.
+        DataError: The slope lies outside 0.5 to 2.
     """
     if recording.velocity is None:
         return recording

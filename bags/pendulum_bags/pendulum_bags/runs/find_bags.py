@@ -11,11 +11,7 @@ __all__ = ["bags_below"]
 
 
 def bags_below(folder: Path, suffixes: Collection[str] = ()) -> Iterator[Path]:
-    """Yield bags: folders with storage files, and storage files that were given themselves.
-
-    Args:
-        folder: Where to look, or a bag.
-    """
+    """Yield bags below a folder: folders with storage files, and storage files that were given themselves."""
     if folder.is_file():
         yield folder
         return

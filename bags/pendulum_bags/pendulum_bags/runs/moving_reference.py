@@ -27,14 +27,10 @@ def follows_reference(metadata: Mapping[str, Any], space: str) -> bool:
 def recorded_reference(
     metadata: Mapping[str, Any], space: str, times: NDArray[np.float64], first_answer: float
 ) -> NDArray[np.float64] | None:
-    """Return the reference of the angle at some times, from upright, shape (n,) [rad].
+    """Return the reference of the angle at some times [s], from upright, shape (n,) [rad], or None if it did not move.
 
-    None where none moved, or where the bag does not hold its parameters or its beginning. The way onto it, in the first
-    second or so after the first answer, is not in it.
-
-    Args:
-        times: Shape (n,) [s].
-        first_answer: When the controller answered its first state [s].
+    Also None if the bag lacks its parameters or its beginning. The approach, in the first second or so after
+    ``first_answer`` [s], is not included.
     """
     if not follows_reference(metadata, space):
         return None

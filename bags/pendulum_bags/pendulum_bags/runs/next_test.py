@@ -24,14 +24,11 @@ _LEFT_OUT = ("--yes", "--json")
 
 
 def next_test_of(records: Sequence[Mapping[str, Any]], plant: str, bags: Sequence[str] = ()) -> str:
-    """Return the command that runs a recorded experiment again with another plant and other noise.
+    """Return the command that repeats a recorded experiment with another plant and new noise, or "".
 
     Args:
-        records: What bags say of their runs; the first that was an experiment is run again, under noise of none.
-        bags: The recordings; beside one of several joints lies its emulated machine, which is kept, not drawn again.
-
-    Returns:
-        The command; empty where no record tells of an experiment that compares two plants.
+        records: Run records of bags; the first of an experiment is repeated.
+        bags: The recordings; the emulated machine next to one of several joints is reused.
     """
     seen = {str(record.get("seed", "")) for record in records}
     command = next(filter(None, (_again(record, plant, seen) for record in records)), "")
@@ -43,14 +40,9 @@ def next_test_of(records: Sequence[Mapping[str, Any]], plant: str, bags: Sequenc
 
 
 def measurement_of(records: Sequence[Mapping[str, Any]], experiment: str) -> str:
-    """Return the command of another experiment with the plants of a recorded one.
+    """Return the command of another experiment with the plants of the first recorded one on the emulator, or "".
 
-    Args:
-        records: What bags say of their runs; the first that was an experiment on the emulator counts.
-        experiment: ``frequency_response`` or ``ranking``.
-
-    Returns:
-        The command; empty where no record tells of such an experiment: these two move no other hardware.
+    ``experiment`` is ``frequency_response`` or ``ranking``, which move no other hardware.
     """
     for words in map(_words, records):
         hardware = set(_values_of("--hardware", words)) - {"emulator"}
@@ -62,15 +54,7 @@ def measurement_of(records: Sequence[Mapping[str, Any]], experiment: str) -> str
 
 
 def with_budget(records: Sequence[Mapping[str, Any]], seconds: float = 0.0) -> str:
-    """Return the command that carries out a recorded experiment again, all of it.
-
-    Args:
-        records: What bags say of their runs; the first that was an experiment counts.
-        seconds: Another budget; 0 for the default [s].
-
-    Returns:
-        The command; empty where no record tells of an experiment that compares two plants.
-    """
+    """Return the command that repeats the first recorded experiment, with another budget [s] or the default for 0."""
     for words in map(_words, records):
         if _is_experiment(words):
             kept, _ = _without(words[5:], ("--budget", "--only", "--out", "-o"))
@@ -110,7 +94,7 @@ def _is_experiment(words: Sequence[str]) -> bool:
 
 
 def _without(words: Sequence[str], names: Collection[str]) -> tuple[list[str], dict[str, str]]:
-    """Return words without some options and their values, and the last value of each that was there."""
+    """Return words without some options and their values, and the last value of each."""
     kept: list[str] = []
     left: dict[str, str] = {}
     rest = iter(words)
@@ -124,7 +108,6 @@ def _without(words: Sequence[str], names: Collection[str]) -> tuple[list[str], d
 
 
 def _values_of(option: str, words: Sequence[str]) -> list[str]:
-    """Return the values that an option of a command has, behind it or attached to it."""
     attached = [word.partition("=")[2] for word in words if word.startswith(f"{option}=")]
     return [value for name, value in pairwise(words) if name == option] + attached
 

@@ -32,15 +32,14 @@ def read_recording(
     Args:
         path: File or folder, or a :class:`~pendulum_bags.recordings.reading.Reading`.
         mapping: Mapping file, name of a built-in mapping or the mapping itself; by default the columns are guessed. For
-            a HEBI log the lab file, which says zero, sign and tare; ``free_swing`` takes no effort from a bag.
-        effort: For bags: ``applied`` takes what the plant says it applied (topic ``applied_effort``),
-            ``measured`` the measured joint torque in ``joint_states``.
+            a HEBI log the lab file with zero, sign and tare; ``free_swing`` takes no effort from a bag.
+        effort: For bags: ``applied`` (topic ``applied_effort``) or ``measured`` (joint torque in ``joint_states``).
         namespace: For bags with several plants, such as ``/sim``.
         hold: ``zero`` (a command, held) or ``linear`` (a measurement), in place of the mapping's.
 
     Raises:
-        DataError: for missing columns, unsorted time, NaN, wrong units, or several joints.
-        BagError: for a bag that cannot be read.
+        DataError: Missing columns, unsorted time, NaN, wrong units, or several joints.
+        BagError: A bag cannot be read.
     """
     reading = Reading.of(path)
     if mapping is not None:

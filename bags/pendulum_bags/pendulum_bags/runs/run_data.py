@@ -65,15 +65,15 @@ class RunData:
 
     Args:
         label: Name for tables and legends, such as ``sim``.
-        disturbance: Disturbance torque as commanded, None where none was recorded [N m].
-        applied: Torque that the plant says it applied, None where none was recorded [N m].
-        measured: Measured joint torque over the whole recording, None where states have none [N m].
+        disturbance: Commanded disturbance torque, or None [N m].
+        applied: Torque that the plant reports as applied, or None [N m].
+        measured: Measured joint torque over the whole recording, or None [N m].
         arrival: Intervals between arrivals of states at the recorder during the noise, shape (n - 1,) [s].
         rate_hz: Sampling rate during the noise [Hz].
         events: Events with ``name`` and ``t`` [s].
-        reference: That reference from upright, at the times of the window [rad]; None where it is not known.
-        joint: Joint whose motion this is, of a plant of several; empty of a plant of one.
-        followed: Reference of a file, over the whole recording, None of a bag [rad or m].
+        reference: Moving reference from upright, at the times of the window [rad]; None if unknown.
+        joint: Joint of the motion, of a plant of several; else empty.
+        followed: Reference of a file, over the whole recording; None for a bag [rad or m].
         recorded: Disturbance of a file; ``disturbance`` may be another signal that two files share.
     """
 
@@ -137,7 +137,7 @@ class RunData:
 
 
 def find_prefix(bag: Bag, prefix: str | None = None) -> str:
-    """Return a namespace, by default that of the one plant of a bag, such as ``/sim``; empty for ``/joint_states``.
+    """Return a namespace such as ``/sim``, by default that of the one plant of a bag; empty for ``/joint_states``.
 
     Raises:
         DataError: The bag has no plant, or several and no namespace is given.
@@ -159,10 +159,7 @@ def find_prefix(bag: Bag, prefix: str | None = None) -> str:
 def joints_of(
     path: str | os.PathLike[str], prefix: str | None = None, *, open_bag: OpenBag = read_bag
 ) -> tuple[str, ...]:
-    """Return the joints of a bag's plant of several joints, in order; none of a plant of one, which needs no choice.
-
-    Args:
-        prefix: As :func:`read_run` takes it.
+    """Return the joints of a bag's plant of several joints, in order; none for a plant of one.
 
     Raises:
         BagError: The bag cannot be read.
@@ -207,11 +204,7 @@ def shared_joints(
 
 
 def timing_warning(plants: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a sentence where too many states are missing; the stamps alone do not show why.
-
-    Args:
-        plants: Figures of :func:`plant_summary`, by the plant's name.
-    """
+    """Return a sentence if too many states are missing in the figures of :func:`plant_summary`, by the plant's name."""
     words = [
         f"{name} missed {plant['missed_deadlines']} of {plant['missed_deadlines'] + plant['samples']} states "
         f"({100.0 * missed_share(plant['missed_deadlines'], plant['samples']):.1f} %)"
@@ -254,10 +247,9 @@ def read_run(
         path: A bag, or any recording as a :class:`~pendulum_bags.recordings.reading.Reading` describes it.
         prefix: Namespace of the plant's topics; None for that of its only plant.
         label: Name for tables; by default that of the bag's folder.
-        joint: Joint of a plant of several, see :func:`joints_of`. Its disturbance is the joint's own,
-            else that of the first joint that has one.
-        or_all: Whether the window is the whole recording where it has neither events nor a disturbance. Else it goes
-            from the event ``noise_start`` to ``noise_end``, or from the first to the last sample of the disturbance.
+        joint: Joint of a plant of several, see :func:`joints_of`; with its own disturbance, else the first joint's.
+        or_all: Whether the window is the whole recording if it has neither events nor a disturbance. Else it goes from
+            the event ``noise_start`` to ``noise_end``, or from the first to the last sample of the disturbance.
 
     Raises:
         BagError: The bag cannot be read.
@@ -331,7 +323,7 @@ def read_run(
 
 
 def _run_of(reading: Reading, name: str, joint: str | None) -> RunData:
-    """Return a joint of a file as a run; all of it is the window, or the part that was chosen."""
+    """Return a joint of a file as a run; the window is all of it, or the chosen part."""
     motion = reading.motion
     found = next((one for one in motion.joints if one.name == (joint or motion.joints[0].name)), None)
     if found is None or (joint is None and len(motion.joints) > 1):
@@ -452,7 +444,6 @@ def noise_hold_time(run: RunData) -> float | None:
 
 
 def _increasing(array: NDArray[Any]) -> NDArray[Any]:
-    """Return the messages ordered by stamp, each stamp once."""
     _, first = np.unique(array["stamp_ns"], return_index=True)
     return array[first]
 
@@ -480,7 +471,7 @@ def _optional(
 
 
 def _answers(stamps: NDArray[np.int64], commands: NDArray[Any] | None, otherwise: NDArray[Any]) -> NDArray[np.float64]:
-    """Return the torque that the controller gave in answer to each state; the newest one where an answer is missing."""
+    """Return the torque that the controller returned for each state, else the newest."""
     if commands is None:
         # A recording without commands still has the measured torque.
         return np.nan_to_num(otherwise)

@@ -55,10 +55,7 @@ _PACKAGES = (
 
 
 def create_run_folder(out: Path | None, experiment: str) -> Path:
-    """Create the folder of a run and return it.
-
-    Args:
-        out: Where the user wants it; None for ``bags/runs/<UTC>_<experiment>`` below the current folder.
+    """Create and return the folder of a run, by default ``bags/runs/<UTC>_<experiment>`` below the current folder.
 
     Raises:
         BagError: The folder exists and is not empty, or cannot be written.
@@ -82,10 +79,7 @@ def create_run_folder(out: Path | None, experiment: str) -> Path:
 
 
 def discard_if_empty(folder: Path) -> bool:
-    """Remove a run's folder in which no bag has been begun; tell whether it was removed.
-
-    A run that broke off has taken its bags with it: its reason and its logs are a record too.
-    """
+    """Remove a run's folder without bags, unless an aborted run left its reason and logs; return whether."""
     if any(folder.glob("*/metadata.yaml")) or (folder / _STALLS).exists():
         return False
     shutil.rmtree(folder, ignore_errors=True)
@@ -93,10 +87,7 @@ def discard_if_empty(folder: Path) -> bool:
 
 
 def pair_folders(folder: Path) -> list[Path]:
-    """Return the folders with the bags ``sim`` and ``hw`` of a run: its own, and those of its repeats in order.
-
-    Of a repeat whose simulation had not begun when the experiment ended, the hardware alone is there: it is no pair.
-    """
+    """Return the folders with both bags ``sim`` and ``hw`` of a run: its own, and those of its repeats in order."""
     repeats = [place for place in (folder / REPEATS).glob("*") if place.name.isdigit() and (place / "sim").is_dir()]
     return [folder, *sorted(repeats, key=lambda place: int(place.name))]
 
@@ -121,11 +112,7 @@ def read_looks(folder: Path) -> int:
 
 
 def write_stall(folder: Path, reason: str, logs: str) -> None:
-    """Add a run that a stalled machine broke off to what a run folder tells of itself.
-
-    Args:
-        logs: Folder of its logs within the run's folder; empty for none.
-    """
+    """Add a run that a stalled computer aborted to the record of a run folder, with its folder of ``logs`` or ""."""
     write_json(folder / _STALLS, {"stalls": [*read_stalls(folder), {"reason": reason, "logs": logs}]})
 
 

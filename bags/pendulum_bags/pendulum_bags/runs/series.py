@@ -41,11 +41,10 @@ def _as_columns(name: str, t: ArrayLike, columns: dict[str, ArrayLike], least: i
 
 @dataclass(frozen=True)
 class Signal:
-    """A scalar over time that is held from sample to sample, such as a torque [N m].
+    """A scalar over time that is held from sample to sample, such as a torque [N m], shape (n,).
 
     Args:
         t: Stamps, strictly increasing, shape (n,) [s].
-        value: Shape (n,).
     """
 
     t: Array
@@ -76,11 +75,11 @@ class Series:
 
     Args:
         t: Stamps, strictly increasing, shape (n,) [s].
-        position: Angle, continuous (not wrapped), shape (n,) [rad]; of a joint that slides, its place [m].
+        position: Angle, continuous (not wrapped) [rad], or position of a sliding joint [m], shape (n,).
         velocity: Shape (n,) [rad/s or m/s].
-        effort: Torque of the controller in answer to each state, shape (n,) [N m or N]; 0 of a joint without a motor.
+        effort: Torque of the controller for each state, shape (n,) [N m or N]; 0 for a joint without a motor.
         unit: Of the position, ``rad`` or ``m``.
-        drive_unit: Of the effort, where it is no torque or force; else empty.
+        drive_unit: Of the effort, if it is no torque or force; else empty.
     """
 
     t: Array
@@ -127,11 +126,7 @@ class Series:
         return float(self.t[-1] - self.t[0])
 
     def between(self, start: float, stop: float) -> Series:
-        """Return the samples with ``start <= t < stop`` [s].
-
-        Raises:
-            DataError: Fewer than four samples lie there.
-        """
+        """Return the samples with ``start <= t < stop`` [s]; a DataError for fewer than four."""
         first, last = np.searchsorted(self.t, (start, stop), side="left")
         if last - first < 4:
             raise DataError(
@@ -151,14 +146,7 @@ class Series:
         return replace(self, t=self.t - delay)
 
     def interpolated(self, times: Array) -> Series:
-        """Return the motion at other times: cubic splines for angle and velocity, effort held as it is applied.
-
-        Args:
-            times: Inside the span of this series, shape (m,) [s].
-
-        Raises:
-            DataError: A time lies outside; splines do not extrapolate here.
-        """
+        """Return the motion at other times within it, shape (m,) [s]: cubic splines, effort held; or a DataError."""
         if times[0] < self.t[0] or times[-1] > self.t[-1]:
             raise DataError(
                 f"{self.name} spans {self.t[0]:.6f} s to {self.t[-1]:.6f} s and is asked for "
@@ -171,11 +159,7 @@ class Series:
 
 
 def shared_span(*series: Series) -> tuple[float, float]:
-    """Return the first and last time [s] at which all series have data.
-
-    Raises:
-        DataError: There is no such time.
-    """
+    """Return the first and last time [s] at which all series have data; a DataError if there is none."""
     start = max(float(one.t[0]) for one in series)
     stop = min(float(one.t[-1]) for one in series)
     if not stop > start:
@@ -194,7 +178,7 @@ def uniform_times(start: float, stop: float, period: float) -> Array:
 def unwrap_near_upright(position: ArrayLike) -> Array:
     """Return continuous angles, moved by whole turns so that their median lies in [-pi/2, 3 pi/2) [rad].
 
-    Both places of rest, 0 hanging and pi upright, are far inside: two pendulums that hang are not a turn apart.
+    Hanging (0) and upright (pi) are both far from the ends of that range.
     """
     angles = np.unwrap(np.asarray(position, dtype=float))
     turn = 2.0 * np.pi

@@ -33,7 +33,7 @@ def answer_of(
         folders: Folders that may have further layers: of the run, or of experiments that measured them.
         more: How to record more if that is missing.
         how: The command that measures a layer, if it differs for the recordings' plants.
-        refused: Why no plant could be identified from the recordings, as a sentence; empty if not tried.
+        refused: Why no plant could be identified from the recordings, as a sentence, or empty.
 
     Raises:
         DataError: A stored layer cannot be read, is in two of the folders, or is of other plants.
@@ -57,7 +57,7 @@ def answer_of(
 
 
 def _needed(comparison: Comparison) -> float:
-    """Return how many more runs an undecided comparison needs; infinity where more would hardly decide it."""
+    """Return the further runs that an undecided comparison needs; infinity if more hardly decide it."""
     runs = comparison.verdict.more_runs
     return math.inf if runs is None else float(runs)
 

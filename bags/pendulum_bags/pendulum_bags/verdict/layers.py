@@ -69,7 +69,7 @@ class Evidence:
 
     Args:
         unit: Its unit; empty for none.
-        estimate: Its value; None if it does not exist.
+        estimate: Its value, or None.
         low: Lower end of its interval, or None.
         expected: The criterion as text, such as ``within ±0.3 deg``; empty for mere information.
     """
@@ -98,11 +98,11 @@ class LayerResult:
     """The result of one layer.
 
     Args:
-        next_steps: One sentence or command each; empty if there is nothing to do.
-        reason: Clause for the whole answer, without a full stop: why it is no or undecided, such as "the spread of the
-            velocity is 31 % smaller on the hardware".
+        next_steps: One sentence or command each, or empty.
+        reason: Clause for the whole answer: why it is no or undecided, such as "the spread of the velocity is 31 %
+            smaller on the hardware".
         holds: Clause with what is reliable although another layer is no, such as "designs with a margin above 0.21
-            stabilise the hardware too"; empty for nothing.
+            stabilise the hardware too", or empty.
     """
 
     layer: Layer
@@ -152,8 +152,8 @@ class Answer:
     """The sum of all layers.
 
     Args:
-        decides: Which of two contradicting tests decides about what, as a sentence; empty if none contradict.
-        holds: Clause with what remains true although the answer is not yes; empty for nothing.
+        decides: Sentence on which of two contradicting tests takes precedence, or empty.
+        holds: Clause with what remains true although the answer is not yes, or empty.
         text: The answer as text if it is more than the sum of these.
     """
 
@@ -201,9 +201,8 @@ def sum_up(
 ) -> Answer:
     """Return one answer from the layers that were measured.
 
-    One no makes it no: each layer covers something that designing needs. It is yes if at least one layer was measured
-    and all measured ones are yes; the sentence then names the others. It also keeps what a layer certifies although
-    another is no.
+    One no makes it no: each layer covers something that a design needs. It is yes if all measured layers (at least one)
+    are; the sentence names the others.
 
     Args:
         results: At most one for each layer; the others count as not measured.

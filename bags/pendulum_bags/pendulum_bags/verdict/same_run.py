@@ -38,8 +38,8 @@ _MOST_RECORDINGS = 4
 def same_run_layer(comparison: Comparison, *, more: str = "", refused: str = "") -> LayerResult:
     """Return the first layer of a comparison.
 
-    ``more`` tells how to record more, such as ``make experiment ARGS="--budget 120"``; by default the number of runs.
-    ``refused`` is why no plant could be identified from the recordings, as a sentence; empty if not tried.
+    ``more`` is how to record more, such as ``make experiment ARGS="--budget 120"``; by default the number of runs.
+    ``refused`` is why no plant could be identified, as a sentence, or empty.
     """
     verdict = comparison.verdict
     tests = verdict.tests
@@ -246,8 +246,8 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest], refused
 def recordings_of(comparison: Comparison) -> list[str]:
     """Return the compared recordings to identify the hardware from, as many as a line holds.
 
-    A repeat in lockstep stays upright, where gravity has little effect, so the run that it repeats comes first, even if
-    it does not count in the comparison: missing states do not harm a fit.
+    A repeat in lockstep stays upright, where gravity has little effect, so the first run precedes it even if it is not
+    tested.
     """
     sources = [pair.hardware.source for pair in comparison.pairs if pair.hardware.source]
     repeated = [path.parents[2] / path.name for path in map(Path, sources) if path.parts[-3:-2] == (REPEATS,)]

@@ -1,9 +1,8 @@
-"""Carry out the whole answer: what the machine does is recorded once, while this process simulates and analyses.
+"""Carry out the whole answer: the machine is recorded once, while this process simulates and analyses.
 
-Plants of one joint are compared in real time first, from ramp to ramp; their machine's other recordings are made while
-the ramps leave the computer idle, and go on behind the analysis. Plants of several joints, which no ramp lifts, begin
-upright in lockstep. Every simulated plant is compared with the same recordings, under the controllers that were
-designed on the given plant.
+Plants of one joint are compared in real time first, from ramp to ramp; their machine's other recordings run while the
+ramps leave the computer idle, and behind the analysis. Plants of several joints begin upright in lockstep. Every
+simulated plant is compared with the same recordings, under controllers designed on the given plant.
 """
 
 from __future__ import annotations
@@ -87,7 +86,7 @@ class Order:
     """What is wanted.
 
     Attributes:
-        budget: Longest wall time of what follows the first recordings; 0 for one analysis of these alone [s].
+        budget: Longest wall time after the first recordings; 0 for one analysis of these alone [s].
         steps: Of :data:`STEPS`.
         domain: ROS domain of the run in real time; None for any free one.
         designs: Designs to certify, as text; none for the default ones.
@@ -138,12 +137,12 @@ class Order:
 
 @dataclass
 class Simulated:
-    """One simulated plant, and what was found of it beside the machine.
+    """One simulated plant, and its results against the machine.
 
     Attributes:
-        budget: That of the next run where this one's did not suffice; 0 where more of it measures nothing [s].
+        budget: Budget of the next run if this one's did not suffice; 0 if more time measures nothing [s].
         comparisons: Of each joint; empty before the first analysis.
-        refused: Why no other plant could be identified from these recordings; empty where none was tried.
+        refused: Why no other plant could be identified from these recordings, or empty.
     """
 
     name: str
@@ -174,11 +173,7 @@ class Simulated:
         return answer_of(self.comparisons, updated=layers, more=more, how=how, refused=self.refused)
 
     def add(self, *layers: LayerResult) -> None:
-        """Add layers of this plant and store them.
-
-        Raises:
-            DataError: They are of another plant or machine.
-        """
+        """Add layers of this plant and store them; a DataError if they are of another plant or machine."""
         for layer in layers:
             case_of(self.comparison).require_same(layer.case, f"“{layer.layer.title}”")
             write_layer(self.folder, layer)
@@ -190,10 +185,9 @@ class Findings:
     """All that a run found.
 
     Attributes:
-        given: The plant that was given.
-        identified: The one that was identified; None for none.
-        deadline: When the run, its page included, has to be over.
-        notes: What could not be done, a sentence each.
+        identified: The identified plant, or None.
+        deadline: End of the run, its page included.
+        notes: What failed, a sentence each.
         interrupted: Whether the user ended it early.
         spent: Whether the budget did.
     """
@@ -214,11 +208,9 @@ class Findings:
 def carry_out(
     folder: Path, order: Order, progress: PhaseProgress, leaving: ExitStack, on_first: Callable[[Simulated], None]
 ) -> Findings:
-    """Record, identify and compare; what is found when the budget ends or the user interrupts is returned.
+    """Record, identify and compare until the budget ends or the user interrupts; return the findings.
 
-    Args:
-        progress: Shows where it is.
-        leaving: Ends the programs and leaves the graph; close it when everything is written.
+    ``leaving`` ends the programs and leaves the graph; close it last.
 
     Raises:
         FaultError: The first recordings failed.
@@ -492,7 +484,6 @@ class _Run:
 
 
 def _undefined(settings: Settings) -> list[LayerResult]:
-    """Return the layers that are not defined for a plant: those in frequency where several joints are driven."""
     if not isinstance(settings, JointSettings):
         return []
     driven = len(load_mechanism(settings.plant).effort_limits)
@@ -502,21 +493,20 @@ def _undefined(settings: Settings) -> list[LayerResult]:
 
 
 def _under_other_noise(settings: _Settings) -> _Settings:
-    """Return the settings of the test of an identified plant, whose fit has seen the noise of the given ones."""
     noise = settings.noise
     other = replace(noise, seed=noise.seed + _TEST_SEED_STEP, duration=max(SHORTEST, noise.duration))
     return replace(settings, noise=other)
 
 
 def _with_plant(settings: Settings, file: Path) -> Settings:
-    """Return the settings that simulate a plant file under the controller that was designed on the given plant."""
+    """Return the settings for a plant file under the controller of the given plant."""
     if isinstance(settings, JointSettings):
         return replace(settings, plant=str(file), design=settings.design_plant)
     return replace(settings, plant=str(file), design=settings.design_plant, simulation="", mapping="")
 
 
 def _of(plant: Simulated, spec: RunSpec) -> RunSpec:
-    """Return a run of the given plant's simulation as one of another plant; the controller stays."""
+    """Return a run of the given plant's simulation as one of another plant with the same controller."""
     settings = plant.settings
     if isinstance(settings, JointSettings):
         return replace(spec, plant=settings.plant)

@@ -49,7 +49,7 @@ _PROBE = 1.0
 
 
 def _laws(spec: RunSpec) -> dict[str, dict[str, Any]]:
-    """Return what contends: for each name, what changes of a run."""
+    """Return the changes of a run for each contender, by name."""
     if (mechanism := spec.mechanism) is None:
         runs = load_study("ranking", seeds=[spec.seed]).runs
         fields = ("controller", "controller_parameters", "disturbance", "duration")
@@ -75,13 +75,10 @@ def _laws(spec: RunSpec) -> dict[str, dict[str, Any]]:
 def contender_specs(
     sim: RunSpec, hw: RunSpec, count: int, seed: int, seeds: int = SEEDS
 ) -> dict[str, list[tuple[RunSpec, RunSpec]]]:
-    """Return the runs of each contender on both sides, under each seed of the noise.
+    """Return the runs of at most ``count`` contenders on both sides, under each seed of the noise.
 
-    Of controllers that command the same, the first alone contends: it would count twice in a correlation. One that
-    refuses the plant does not contend.
-
-    Args:
-        count: Number of contenders, fewer where fewer differ.
+    Controllers that refuse the plant are left out, and those that command the same as an earlier one: they would count
+    twice in a correlation.
     """
     found: dict[str, list[tuple[RunSpec, RunSpec]]] = {}
     seen: list[Any] = []
@@ -107,11 +104,7 @@ def place_of(folder: Path, name: str, spec: RunSpec) -> Path:
 
 
 def keep_run(place: Path, name: str, spec: RunSpec, failure: str = "") -> None:
-    """Store what a run of a ranking is, and its metrics, as a study does; its bag or arrays are in the folder.
-
-    Args:
-        failure: Why the plant stopped; empty where it did not.
-    """
+    """Store the record of a run of a ranking and its metrics; ``failure`` is why the plant stopped, or empty."""
     write_json(place / "spec.json", spec.to_json())
     write_outcome(place, spec, {"controller": name}, failure)
 
@@ -119,11 +112,7 @@ def keep_run(place: Path, name: str, spec: RunSpec, failure: str = "") -> None:
 def simulate_contenders(
     folder: Path, specs: Mapping[str, Sequence[RunSpec]], before: Callable[[], None] = lambda: None
 ) -> None:
-    """Simulate every run in this process, and store it.
-
-    Args:
-        folder: Where to.
-    """
+    """Simulate every run in this process, and store it."""
     for name, runs in specs.items():
         for spec in runs:
             before()
@@ -134,10 +123,6 @@ def simulate_contenders(
 
 
 def rank_folders(sim: Path, hw: Path) -> tuple[Ranking, Case]:
-    """Return the ranking of the contenders with simulated runs in one folder and the machine's in another.
-
-    Raises:
-        DataError: They do not make a ranking.
-    """
+    """Return the ranking of simulated runs in one folder and the machine's in another, or raise a DataError."""
     contenders, case = collect_contenders([*sim.glob("*/sim"), *hw.glob("*/hw")])
     return rank(contenders), case

@@ -39,11 +39,7 @@ _FILES = 20.0
 def write_whole_report(
     folder: Path, summary: Mapping[str, Any], found: Findings, answer: Answer, answers: Sequence[Answer]
 ) -> Path:
-    """Write ``report.html`` and ``figures/`` of a run; return the page.
-
-    Args:
-        summary: Content of ``summary.json``.
-    """
+    """Write ``report.html`` and ``figures/`` of a run; return the page."""
     given = found.given
 
     def extend(page: Page) -> Page:
@@ -79,7 +75,6 @@ def leave_files_out(found: Findings) -> None:
 
 
 def _add(figures: list[Figure], tables: list[Table], plant: Simulated, answer: Answer, *, given: bool) -> None:
-    """Add what was found of a plant; of the given one, the page has tests and evidence already."""
     section = "" if given else f"With {plant.name}"
     mine: list[Figure] = []
     listed: list[Table] = []

@@ -38,7 +38,7 @@ def whole_answer(found: Findings) -> tuple[Answer, list[Answer]]:
 
 
 def _choice(plants: Sequence[Simulated], answers: Sequence[Answer]) -> str:
-    """Return which simulation would have picked the right controller, as a sentence; empty where none was asked."""
+    """Return which simulation picked the right controller, as a sentence, or ""."""
     marks = [next(one.mark for one in answer.layers if one.layer is Layer.SAME_CHOICE) for answer in answers]
     ranking = plants[-1].ranking
     if ranking is None or Mark.NOT_MEASURED in marks:
