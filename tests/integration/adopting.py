@@ -10,15 +10,14 @@ from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.exports.model_files import mjcf
 from pendulum_testing.processes import ProcessGroup, RunningProgram
 
-__all__ = ["EFFORTS", "adopt", "start_robot", "write_model"]
+__all__ = ["EFFORTS", "adopt", "adopt_cart_pole", "start_robot", "write_model"]
 
-_ROBOT = Path(__file__).with_name("plain_plant.py")
 EFFORTS = "/robot/effort_controller/commands"
 
 
-def start_robot(processes: ProcessGroup, name: str = "robot") -> RunningProgram:
+def start_robot(processes: ProcessGroup, name: str = "robot", file: str = "plain_plant.py") -> RunningProgram:
     """Start the node that knows none of our rules."""
-    return processes.start_command([sys.executable, str(_ROBOT)], name=name)
+    return processes.start_command([sys.executable, str(Path(__file__).with_name(file))], name=name)
 
 
 def adopt(processes: ProcessGroup, namespace: str, **changes: object) -> RunningProgram:
@@ -34,6 +33,24 @@ def adopt(processes: ProcessGroup, namespace: str, **changes: object) -> Running
         "state_timeout": 0.5,
         **changes,
     }
+    return _adopt(processes, namespace, told)
+
+
+def adopt_cart_pole(processes: ProcessGroup, namespace: str) -> RunningProgram:
+    """Start the adopter of the plain cart-pole: other order and signs, a further joint, commands of the slide alone."""
+    told: dict[str, object] = {
+        "states": "/robot/joint_states",
+        "commands": EFFORTS,
+        "plant": "cart_pole",
+        "joints": "[-slide,-tilt]",
+        "zeros": f"[0.0,{math.pi}]",
+        "command_joints": "[slide]",
+        "state_timeout": 0.5,
+    }
+    return _adopt(processes, namespace, told)
+
+
+def _adopt(processes: ProcessGroup, namespace: str, told: dict[str, object]) -> RunningProgram:
     arguments = [item for name, value in told.items() for item in ("-p", f"{name}:={value}")]
     return processes.start("pendulum_sim", "adopt", "--ros-args", "-r", f"__ns:={namespace}", *arguments)
 

@@ -8,15 +8,18 @@ from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pendulum_bags.experiments.graph_plant import join
 from pendulum_bags.experiments.orchestrator_node import Orchestrator
 from pendulum_msgs_py.errors import FaultError
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from pendulum_rosbag.reader import read_bag
+from pendulum_sim.exports.model_files import mjcf
 from pendulum_testing.plant_peer import PlantPeer
 from pendulum_testing.processes import ProcessGroup, RunningProgram
-from tests.integration.adopting import adopt, start_robot, write_model
+from tests.integration.adopting import adopt, adopt_cart_pole, start_robot, write_model
 
 pytest.importorskip("mujoco")
 
@@ -62,6 +65,36 @@ def test_an_adopted_plant_is_compared_with_a_model_file_and_goes_on_running(
     peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "the end")
     assert (robot.returncode, adopter.returncode) == (None, None)
     assert peer.states[-1].position[0] == pytest.approx(0.0, abs=0.1)
+
+
+def test_an_adopted_cart_pole_that_a_hand_holds_is_balanced_and_compared_with_a_model_file(
+    processes: ProcessGroup, domain_id: int, peer: PlantPeer, tmp_path: Path
+) -> None:
+    model, out = tmp_path / "model.xml", tmp_path / "run"
+    model.write_text(mjcf(load_mechanism("cart_pole")), encoding="utf-8")
+    robot, adopter = start_robot(processes, file="plain_cart_pole.py"), adopt_cart_pole(processes, "/lab")
+    peer.until(lambda: peer.states and peer.diagnostics.get("mode"), "the adopted plant")
+    peer.leave_the_command()
+    sides = ("--plant", "cart_pole", "--simulation", model, "--hardware", "ros:/lab", "--yes")
+
+    run = experiment(processes, domain_id, out, *sides)
+
+    assert run.wait(150.0) == 0, run.output
+    assert "waits until you hold the plant upright" in run.output
+    assert "Is the simulation good enough to design a controller on?" in run.output
+    with read_bag(out / "hw") as bag:
+        record = bag.metadata["pendulum.run"]
+        assert (record["plant"], record["clock"], record["namespace"]) == ("ros:/lab", "realtime", "/lab")
+        states, applied = bag.joints("/lab/joint_states"), bag.joints("/lab/applied_effort")
+        first = min(event["stamp_ns"] for event in bag.events() if event["name"] == "noise_start")
+    assert states.names == ("cart", "pole")
+    assert states.position[0] == pytest.approx([0.0, math.pi], abs=1e-6)
+    # Upright for as long as it was controlled, and no effort while it is disarmed.
+    held = states.position[states.stamp_ns < first + 1_000_000_000, 1]
+    assert np.max(np.abs(held - math.pi)) < 0.5
+    assert not np.any(applied.effort[applied.stamp_ns < states.stamp_ns[0] + 100_000_000])
+    peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "the end")
+    assert (robot.returncode, adopter.returncode) == (None, None)
 
 
 def test_a_plant_that_is_armed_or_commanded_or_not_there_is_left_alone(

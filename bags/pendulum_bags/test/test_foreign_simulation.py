@@ -14,13 +14,14 @@ from pendulum_bags.commands import experiment_cli
 from pendulum_bags.comparison import Outcome, compare_runs
 from pendulum_bags.comparison.independence import check_pairs
 from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.joint_run import JointSettings
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.repeats import record_repeat, record_simulation, repeat_folder
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.experiments.simulation import ForeignSimulation, recorded_difference
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_differences import plant_differences
-from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
+from pendulum_msgs_py.plants.plant_parameters import load_mechanism, load_plant, write_plant
 from pendulum_rosbag.reader import read_bag
 from pendulum_sim.exports.model_files import mjcf
 
@@ -241,3 +242,43 @@ def test_a_running_plant_needs_its_domain_and_a_simulation_its_equation(
     assert experiment_cli.main(["thesis", *arguments, "--yes", "--out", str(tmp_path / "run")]) == 2
     assert sentence in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "run").exists()
+
+
+# --- several joints ----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def acrobot(tmp_path: Path) -> tuple[Path, Path]:
+    """Return a model file of an acrobot, and its plant file."""
+    plant = load_mechanism("acrobot_frictionless")
+    path = tmp_path / "acrobot.xml"
+    path.write_text(mjcf(plant), encoding="utf-8")
+    return path, write_plant(tmp_path / "acrobot.yaml", plant)
+
+
+def test_a_model_of_two_joints_moves_like_our_simulation_of_its_plant_on_either_side(
+    acrobot: tuple[Path, Path],
+) -> None:
+    model, plant = map(str, acrobot)
+    noise = NoiseSettings(amplitude=0.1, duration=1.0)
+    ours = simulate(JointSettings(plant, noise=noise).run("sim"))
+    for settings, side in (
+        (JointSettings(plant, noise=noise, simulation=model), "sim"),
+        (JointSettings(plant, noise=noise, hardware=model), "hw"),
+    ):
+        theirs = simulate(settings.run(side))
+        assert np.array_equal(theirs.disturbance, ours.disturbance)
+        assert np.max(np.abs(theirs.position - ours.position)) < 0.1 * np.min(np.std(ours.position, axis=0))
+    with pytest.raises(ParameterError, match=r"hardware is hebi; .* give ros:/hw"):
+        JointSettings(plant, hardware="hebi")
+
+
+def test_a_model_of_two_joints_that_does_not_move_as_its_plant_file_is_refused(
+    acrobot: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, plant = map(str, acrobot)
+    heavier = str(write_plant(tmp_path / "heavier.yaml", load_mechanism(plant).with_values({"mass_2": 0.9})))
+    out = ["--out", str(tmp_path / "no"), "--plant", heavier, "--simulation", model]
+    assert experiment_cli.main(["thesis", *out]) == 2
+    assert "does not move as its equation: joint" in capsys.readouterr().err
+    assert not (tmp_path / "no").exists()

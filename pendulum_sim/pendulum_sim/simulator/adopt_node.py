@@ -6,6 +6,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 from rclpy.clock import Clock, ClockType
 from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
@@ -14,29 +15,39 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.contract.joints import Coordinates
 from pendulum_msgs_py.contract.names import JOINT
 from pendulum_msgs_py.contract.plant_specs import LIMIT_SPECS, limits_from_parameters
 from pendulum_msgs_py.contract.shared_supervisor import SharedSupervisor
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind
 from pendulum_msgs_py.contract.timing import SteadyWallClock, Throttle
-from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample
+from pendulum_msgs_py.contract.values import NANOSECONDS, JointSample, Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, load_plant
+from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_NAMES, load_mechanism
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.plant_interface import PlantInterface
 from pendulum_msgs_py.ros.polled import PollingNode
 from pendulum_msgs_py.ros.runner import run_node
 from pendulum_sim.stepping.servo import PositionServo
 
-__all__ = ["SPECS", "AdoptNode", "main"]
+__all__ = ["SPECS", "AdoptNode", "entries_of", "main"]
 
 SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("states", "/joint_states", "", "Topic of its sensor_msgs/JointState.", read_only=True),
     ParameterSpec(
         "commands", "/effort_controller/commands", "", "Topic of its std_msgs/Float64MultiArray.", read_only=True
     ),
-    ParameterSpec("joint", JOINT, "", "Name of its joint in the states.", read_only=True),
+    ParameterSpec(
+        "joints", [""], "", "Names of its joints in the states, in the order of a plant of several; -NAME for one that "
+        "counts the other way.", read_only=True,
+    ),
+    ParameterSpec("zeros", [0.0], "rad or m", "Its positions when hanging; one stands for all.", read_only=True),
+    ParameterSpec(
+        "command_joints", [""], "", "Names of the joints that the entries of the commands stand for; empty for the "
+        "driven ones.", read_only=True,
+    ),
+    ParameterSpec("joint", JOINT, "", "Name of its one joint in the states.", read_only=True),
     ParameterSpec("command_index", 0, "-", "Entry of the commands that is the joint's.", minimum=0, read_only=True),
     ParameterSpec(
         "command_size", 1, "-", "Number of entries of the commands; others are 0.", minimum=1, read_only=True
@@ -45,7 +56,8 @@ SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("zero", 0.0, "rad", "Its angle when the link hangs.", read_only=True),
     ParameterSpec(
         "plant", "thesis", "",
-        f"Preset ({PRESET_NAMES}) or plant file that describes it: limit of torque, and position control.",
+        f"Preset ({PRESET_NAMES}; of several joints: {', '.join(MECHANISM_PRESETS)}) or plant file that describes it: "
+        "joints, limits of effort, and position control of one joint.",
         read_only=True,
     ),
     ParameterSpec(
@@ -65,6 +77,39 @@ _LAST_ZEROS = 5
 """Zero efforts at the end."""
 
 
+class _Entries(NamedTuple):
+    """Where the adopted plant has what: its n joints by name, with signs and zeros, and the places of m commands."""
+
+    names: tuple[str, ...]
+    signs: tuple[float, ...]
+    zeros: tuple[float, ...]
+    places: tuple[int, ...]
+    size: int
+
+
+def entries_of(values: Mapping[str, Any], coordinates: Coordinates) -> _Entries:
+    """Return the entries of parameters; a ParameterError if they do not fit the plant's joints."""
+    given, n = [name for name in values["joints"] if name], len(coordinates.joints)
+    commanded = [name for name in values["command_joints"] if name]
+    if n == 1 and not given and not commanded:
+        return _Entries(
+            (values["joint"],), (float(values["sign"]),), (values["zero"],), (values["command_index"],),
+            values["command_size"],
+        )  # fmt: skip
+    names = tuple(name.removeprefix("-") for name in given) or coordinates.names
+    if len(names) != n or len(set(names)) != n:
+        raise ParameterError(f"joints are {', '.join(given)}; expected {n} names, of {coordinates.with_units}")
+    driven = [names[index] for index in coordinates.driven]
+    commanded = commanded or driven
+    if missing := [name for name in driven if name not in commanded]:
+        raise ParameterError(
+            f"command_joints are {', '.join(commanded)}; expected {missing[0]}, which is driven, in it"
+        )
+    signs = tuple(-1.0 if name.startswith("-") else 1.0 for name in given) or (1.0,) * n
+    places = tuple(commanded.index(name) for name in driven)
+    return _Entries(names, signs, coordinates.for_each("zeros", values["zeros"]), places, len(commanded))
+
+
 class AdoptNode(PollingNode):
     """Applies the contract's rules to a plant on the graph.
 
@@ -76,22 +121,26 @@ class AdoptNode(PollingNode):
         super().__init__("simulator", enable_logger_service=True)
         self._settings = NodeParameters(self, SPECS, _check)
         values = self._settings.values
-        plant = load_plant(values["plant"])
-        self._joint: str = values["joint"]
-        self._sign, self._zero = float(values["sign"]), values["zero"]
-        self._efforts = [0.0] * values["command_size"]
-        self._index: int = values["command_index"]
-        late = plant.transport_delay + _LATENESS * values["period"]
-        self._servo = PositionServo(plant.with_values(transport_delay=late), values["period"])
+        plant = load_mechanism(values["plant"])
+        self._coordinates, self._entries = plant.coordinates, entries_of(values, plant.coordinates)
+        self._efforts = [0.0] * self._entries.size
+        self._no_effort = (0.0,) * len(plant.coordinates.driven)
+        self._servo = None
+        if plant.is_pendulum:
+            late = plant.transport_delay + _LATENESS * values["period"]
+            self._servo = PositionServo(plant.with_values(transport_delay=late), values["period"])
         self._clock_ns = SteadyWallClock()
         limits = limits_from_parameters(
             values,
-            (plant.effort_limit,),
+            plant.effort_limits,
+            coordinates=plant.coordinates,
             lockstep=False,
             feedback_timeout=values["state_timeout"],
             least_command_timeout=_LATENESS * values["period"],
         )
-        self._supervisor = SharedSupervisor(limits, self._preflight)
+        self._supervisor = SharedSupervisor(
+            limits, self._preflight, coordinates=plant.coordinates, follows=self._servo is not None
+        )
         self._odd: Counter[str] = Counter()
         self._lines = Throttle(1.0)
         self._interface = PlantInterface(
@@ -105,16 +154,17 @@ class AdoptNode(PollingNode):
         self.create_timer(
             0.25 * values["state_timeout"], self._on_silence, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
-        self.get_logger().info(f"adopts joint {self._joint!r} of {values['states']}, efforts to {values['commands']}")
+        self._joint = ", ".join(map(repr, self._entries.names))
+        self.get_logger().info(f"adopts {self._joint} of {values['states']}, efforts to {values['commands']}")
 
     def close(self) -> None:
         """Disarm, and send zero efforts: the plant may hold the last one forever."""
         self._interface.safe_stop("adopt ends")
         for _ in range(_LAST_ZEROS):
-            self._send(0.0)
+            self._send(self._no_effort)
             time.sleep(0.01)
         if self._interface.sample is not None:
-            self._interface.publish_applied(self._interface.sample.stamp_ns, (0.0,))
+            self._interface.publish_applied(self._interface.sample.stamp_ns, self._no_effort)
         self._interface.close()
 
     def _on_state(self, data: bytes) -> None:
@@ -140,46 +190,57 @@ class AdoptNode(PollingNode):
             self._answer(drive if drive.kind is DriveKind.EFFORT else Drive(DriveKind.OFF), sample)
 
     def _answer(self, drive: Drive, sample: JointSample | None) -> None:
-        (effort,) = drive.effort
+        effort = drive.effort
         if drive.kind is DriveKind.POSITION and sample is not None:
+            assert self._servo is not None
             (limit,) = self._supervisor.limits.effort
             where, wanted = (sample.position[0], sample.velocity[0]), (drive.position[0], drive.velocity[0])
-            effort = self._servo.effort(*where, *wanted, limit=limit)
+            effort = (self._servo.effort(*where, *wanted, limit=limit),)
         others = self.count_publishers(self._settings.values["commands"]) - 1
         if others > 0 and self._supervisor.mode.armed:
             self._supervisor.fault(self._not_alone(others), self._clock_ns())
-            effort = 0.0
+            effort = self._no_effort
         self._send(effort)
         if sample is not None:
-            self._interface.publish_applied(sample.stamp_ns, (effort,))
+            self._interface.publish_applied(sample.stamp_ns, effort)
 
-    def _send(self, effort: float) -> None:
-        self._efforts[self._index] = self._sign * effort
+    def _send(self, effort: Vector) -> None:
+        for joint, place, value in zip(self._coordinates.driven, self._entries.places, effort, strict=True):
+            self._efforts[place] = self._entries.signs[joint] * value
         self._commands.publish(Float64MultiArray(data=self._efforts))
 
     def _sample(self, message: JointState, now_ns: int) -> JointSample | None:
-        if self._joint not in message.name:
-            self._refuse(f"a state of {', '.join(message.name) or 'no joint'}; expected {self._joint!r}")
+        entries, before = self._entries, self._interface.sample
+        if missing := [name for name in entries.names if name not in message.name]:
+            self._refuse(f"a state of {', '.join(message.name) or 'no joint'}; expected {missing[0]!r}")
             return None
-        i = message.name.index(self._joint)
-        if len(message.position) <= i or len(message.velocity) <= i:
-            self._refuse(f"a state of {self._joint!r} without position or velocity; expected both")
+        at = [message.name.index(name) for name in entries.names]
+        if len(message.position) <= max(at) or len(message.velocity) <= max(at):
+            self._refuse(f"a state of {self._joint} without position or velocity; expected both")
             return None
-        effort = message.effort[i] if len(message.effort) > i else math.nan
-        theta = self._sign * (message.position[i] - self._zero)
-        if self._interface.sample is not None and math.isfinite(theta):
-            # Adopted angles may wrap; the contract's do not.
-            before = self._interface.sample.position[0]
-            theta = before + wrap(theta - before)
-        if math.isnan(effort) and self._interface.sample is None:
-            self.get_logger().warning(f"states of {self._joint!r} have no effort: measured torque is NaN from here on")
-        sample = JointSample.of_one(now_ns, theta, self._sign * message.velocity[i], self._sign * effort)
+        measured = len(message.effort) > max(at)
+        position, velocity, effort = [], [], []
+        for i, (index, joint, sign) in enumerate(zip(at, self._coordinates.joints, entries.signs, strict=True)):
+            q = sign * (message.position[index] - entries.zeros[i])
+            if before is not None and math.isfinite(q) and joint.unit == "rad":
+                # Adopted angles may wrap; the contract's do not.
+                q = before.position[i] + wrap(q - before.position[i])
+            position.append(q)
+            velocity.append(sign * message.velocity[index])
+            of_driven = sign * message.effort[index] if measured else math.nan
+            effort.append(of_driven if i in self._coordinates.driven else 0.0)
+        if not measured and before is None:
+            self.get_logger().warning(f"states of {self._joint} have no effort: measured torque is NaN from here on")
+        sample = JointSample(now_ns, tuple(position), tuple(velocity), tuple(effort))
         if not sample.is_finite():
             self._refuse("a state is not finite")
             if self._supervisor.mode.armed:
-                position, velocity = message.position[i], message.velocity[i]
-                self._supervisor.fault(f"its state is not finite: {position} rad, {velocity} rad/s", now_ns)
-                self._send(0.0)
+                states = ", ".join(
+                    f"{message.position[index]} {joint.unit}, {message.velocity[index]} {joint.velocity_unit}"
+                    for index, joint in zip(at, self._coordinates.joints, strict=True)
+                )
+                self._supervisor.fault(f"its state is not finite: {states}", now_ns)
+                self._send(self._no_effort)
                 self._interface.decide(now_ns)
             return None
         return sample

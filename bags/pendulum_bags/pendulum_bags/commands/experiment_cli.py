@@ -39,6 +39,8 @@ from pendulum_bags.experiments.graph_plant import PREFIX as GRAPH_PREFIX
 from pendulum_bags.experiments.operator import ask_for_running, confirmed
 from pendulum_bags.experiments.plant_options import (
     AcceptDifferences,
+    AnySimulation,
+    HardwareMapping,
     MappingFile,
     SimulatedPlant,
     Simulation,
@@ -72,13 +74,6 @@ app = typer.Typer(
     add_completion=False,
 )
 
-AnySimulation = Annotated[
-    str,
-    typer.Option(
-        help="In the simulator's place: a model file (MJCF or URDF, run by MuJoCo), gymnasium:ID, or ros:/NAMESPACE "
-        "for a plant that runs already on --domain; that one needs --plant, too."
-    ),
-]
 Seed = Annotated[int, typer.Option(help="Seed of the noise; one seed is one signal.", min=0)]
 Amplitude = Annotated[float, typer.Option(help="Largest torque of the noise [N m].")]
 HoldTime = Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")]
@@ -88,10 +83,7 @@ Controller = Annotated[str, typer.Option(help="Kind of controller, or a policy f
 
 _OF_SEVERAL_JOINTS = {"duration", "amplitude", "hold_time", "controller", "hardware"}
 """Options of ``thesis`` whose defaults are others for several joints."""
-_OF_ONE_JOINT = {
-    *("simulation", "mapping", "accept_differences", "hardware_mapping", "lab", "yes", "domain"),
-    *("strategy", "q", "r", "ramp_speed"),
-}
+_OF_ONE_JOINT = {"lab", "strategy", "q", "r", "ramp_speed"}
 """Options of ``thesis`` that plants of several joints do not have."""
 
 
@@ -113,9 +105,7 @@ def thesis(
             "file or gymnasium:ID. Or ros:/NAMESPACE for a plant that runs already on --domain."
         ),
     ] = "emulator",
-    hardware_mapping: Annotated[
-        Path | None, typer.Option(help="Mapping file of a simulation that --hardware names.")
-    ] = None,
+    hardware_mapping: HardwareMapping = None,
     lab: Lab = None,
     yes: Yes = False,
     strategy: Annotated[
@@ -171,6 +161,12 @@ def thesis(
         joints(
             out,
             plant,
+            simulation=simulation,
+            mapping=mapping,
+            accept_differences=accept_differences,
+            hardware_mapping=hardware_mapping,
+            yes=yes,
+            domain=domain,
             seed=seed,
             storage=storage,
             margin=margin,

@@ -6,6 +6,7 @@ import re
 from typing import TYPE_CHECKING
 
 from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.errors import FaultError, ParameterError
 
 if TYPE_CHECKING:
@@ -49,16 +50,17 @@ def find_plant(orchestrator: Orchestrator, namespace: str) -> str:
     return orchestrator.wait_for(f"a plant in {namespace}", found, _PATIENCE)[0]
 
 
-def join(orchestrator: Orchestrator, space: str) -> PlantClient:
+def join(orchestrator: Orchestrator, space: str, coordinates: Coordinates = ONE_JOINT) -> PlantClient:
     """Return a client of a running plant that is at rest and has no other commander; nothing is sent to it.
 
-    A FaultError if there is none, or it has another commander, is armed, has other joints, or does not hang near 0.
+    A FaultError if there is none, or it has another commander, is armed, has other joints, or, as a pendulum, does not
+    hang near 0.
     """
     from pendulum_bags.experiments.orchestrator_node import PlantClient
 
     node = find_plant(orchestrator, space)
     _refuse_others(orchestrator, space)
-    client = PlantClient(orchestrator, space, node)
+    client = PlantClient(orchestrator, space, node, joints=coordinates.names)
     client.wait_until_ready(_PATIENCE, controller=False, disturbance=False)
     # Discovery is complete by then: node information is no older than services.
     orchestrator.spin(0.5)
@@ -70,7 +72,7 @@ def join(orchestrator: Orchestrator, space: str) -> PlantClient:
             f"python -m pendulum_bags move down --namespace {space})"
         )
     assert client.sample is not None
-    if abs(angle := client.sample.position[0]) > _HALF_TURN:
+    if coordinates == ONE_JOINT and abs(angle := client.sample.position[0]) > _HALF_TURN:
         raise FaultError(
             f"{space} is at {angle:.2f} rad; expected it within half a turn of hanging at 0: reset its zero"
         )

@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_bags.experiments.settings import NoiseSettings
+from pendulum_bags.experiments.settings import NoiseSettings, Sides
+from pendulum_bags.runs.case import IDENTITY
+from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_msgs_py.contract.names import JOINT_STATES
-from pendulum_msgs_py.contract.values import NANOSECONDS
+from pendulum_msgs_py.contract.values import NANOSECONDS, Vector
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, is_mechanism, load_mechanism, write_plant
 from pendulum_rosbag.reader.bag import read_bag
@@ -26,6 +28,7 @@ __all__ = [
     "design_for",
     "driven_joint",
     "fall_time",
+    "has_fallen",
     "identified_names",
     "load_surrogate",
     "require_upright",
@@ -52,10 +55,11 @@ this noise. At 1 the pendubot falls; at 0.25 both plants stay, nearer to the lim
 
 
 @dataclass(frozen=True)
-class JointSettings:
-    """Noise on one joint of a plant that a controller holds upright, in simulation and on an emulated machine.
+class JointSettings(Sides):
+    """Noise on one joint of a plant that a controller holds upright, in simulation and on a machine.
 
     Attributes:
+        machine: Plant file of the emulated machine, or of a simulation in its place; empty for ``plant``.
         design: Preset or file that the controller is designed on; empty for the simulated plant.
         joint: Driven joint that has the noise; empty for the first.
         noise: The disturbance, such as one of :func:`default_amplitude`.
@@ -69,11 +73,12 @@ class JointSettings:
     noise: NoiseSettings = field(default_factory=lambda: NoiseSettings(duration=DURATION))
     storage: str = "mcap"
     controller: str = "lqr"
-    can_repeat: ClassVar[bool] = True
-    is_emulated: ClassVar[bool] = True
-    hardware: ClassVar[str] = "emulator"
+    simulation: str = ""
+    mapping: str = ""
+    hardware: str = "emulator"
+    hardware_mapping: str = ""
     strategy: ClassVar[str] = ""
-    foreign: ClassVar[None] = None
+    method: ClassVar[str] = "auto"
 
     def __post_init__(self) -> None:
         """Validate the settings; the joint defaults to the first driven one."""
@@ -85,6 +90,12 @@ class JointSettings:
         object.__setattr__(self, "joint", driven_joint(self.plant, self.joint))
         if self.controller not in HOLDING:
             raise ParameterError(f"controller is {self.controller!r}; expected one of {', '.join(HOLDING)}")
+        if self.hardware == "hebi":
+            raise ParameterError(
+                "hardware is hebi; with several joints start the bridge (python -m pendulum_hw_bridge bridge) and give "
+                "ros:/hw: somebody has to hold the plant upright"
+            )
+        self._check_sides(self.noise.hold_time)
 
     @property
     def design_plant(self) -> str:
@@ -101,15 +112,16 @@ class JointSettings:
         """Wall time of the first recordings, measured on two cores [s]."""
         return 6.0 + 0.25 * self.noise.duration
 
-    def running(self, side: str) -> None:
-        """Return None: no plant of several joints runs already."""
+    def plant_of(self, side: str) -> str:
+        """Return the preset or file of a side's plant."""
+        return self.plant if side == "sim" else self.machine or self.plant
 
     def run(self, side: str) -> RunSpec:
         """Return one side as a run in lockstep, for as long as the noise lasts."""
-        noise = self.noise
+        noise, foreign = self.noise, self.foreign_of(side)
         return RunSpec(
             side=side,
-            plant=self.plant if side == "sim" else self.machine or self.plant,
+            plant=self.plant_of(side),
             design_plant=self.design_plant,
             controller=self.controller,
             disturbance={
@@ -122,12 +134,20 @@ class JointSettings:
             duration=noise.duration,
             seed=noise.seed,
             storage=self.storage,
+            simulation="" if foreign is None else foreign.name,
+            mapping="" if foreign is None else foreign.mapping,
         )
 
+    def metadata(self, side: str) -> dict[str, Any]:
+        """Return the metadata of the bag of a side that runs already."""
+        name, space = (self.simulation if side == "sim" else self.hardware), self.namespace(side)
+        own = {"clock": "realtime", "plant": name, "emulated_plant": "", IDENTITY: space, "namespace": space}
+        return {RUN_RECORD: {**self.run(side).metadata()[RUN_RECORD], **own, "experiment": "joints"}}
 
-def driven_joint(plant: str, joint: str = "") -> str:
+
+def driven_joint(plant: str | PlantParameters, joint: str = "") -> str:
     """Return the joint that has the noise: the named or the first driven one; a ParameterError if there is none."""
-    loaded = load_mechanism(plant)
+    loaded = plant if isinstance(plant, PlantParameters) else load_mechanism(plant)
     driven = loaded.coordinates.driven_names
     if not driven:
         raise ParameterError(f"plant {loaded.name!r} has no driven joint; expected an actuator at one of its joints")
@@ -136,10 +156,10 @@ def driven_joint(plant: str, joint: str = "") -> str:
     return joint or driven[0]
 
 
-def default_amplitude(plant: str, joint: str = "") -> float:
+def default_amplitude(plant: str | PlantParameters, joint: str = "") -> float:
     """Return the largest effort of the noise, a share of its joint's effort limit [N m or N]."""
-    loaded = load_mechanism(plant)
-    index = loaded.coordinates.driven_names.index(driven_joint(plant, joint))
+    loaded = plant if isinstance(plant, PlantParameters) else load_mechanism(plant)
+    index = loaded.coordinates.driven_names.index(driven_joint(loaded, joint))
     return loaded.effort_limits[index] / LIMIT_PER_NOISE
 
 
@@ -204,12 +224,16 @@ def load_surrogate(path: str | Path, plant: PlantParameters) -> PlantParameters:
     return found
 
 
+def has_fallen(plant: PlantParameters, position: Vector) -> bool:
+    """Return whether a plant has lost half of its potential energy at n positions [rad or m]."""
+    potential, p = plant.mechanism.potential, plant.packed
+    return bool(potential(position, p) < 0.5 * potential(plant.coordinates.goal, p))
+
+
 def fall_time(plant: PlantParameters, stamps_ns: Array, position: Array) -> float | None:
     """Return when a plant had lost half of its potential energy [s], or None; positions (N, n), stamps [ns]."""
-    potential, p = plant.mechanism.potential, plant.packed
-    half = 0.5 * potential(plant.coordinates.goal, p)
     for stamp_ns, q in zip(stamps_ns, position, strict=True):
-        if potential(tuple(q), p) < half:
+        if has_fallen(plant, tuple(q)):
             return float(stamp_ns - stamps_ns[0]) / NANOSECONDS
     return None
 
@@ -219,6 +243,9 @@ def require_upright(folder: Path, settings: JointSettings, stopped: str = "") ->
     plant = load_mechanism(settings.plant)
     ends: dict[str, str] = {}
     for side, words in (("sim", "simulation"), ("hw", "emulated hardware")):
+        if settings.running(side) is not None:
+            # It was watched while it ran, and falls when it is disarmed.
+            continue
         with read_bag(folder / side) as opened:
             states = opened.joints(f"/{side}/{JOINT_STATES}")
         fell = fall_time(plant, states.stamp_ns, states.position) if len(states.stamp_ns) else None

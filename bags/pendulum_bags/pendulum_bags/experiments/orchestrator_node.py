@@ -23,6 +23,7 @@ from trajectory_msgs.msg import JointTrajectory
 
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.drive import Mode
+from pendulum_msgs_py.contract.joints import ONE_JOINT
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.trajectory import Trajectory
 from pendulum_msgs_py.contract.values import JointSample
@@ -137,6 +138,7 @@ class PlantClient:
         namespace: Namespace of the plant's topics, such as ``/sim``.
         controller, disturbance: Names of their nodes, empty for none.
         watch: Subscribe to its states now; a plant in lockstep waits for its last listener, which may be this one.
+        joints: Names of its joints.
     """
 
     def __init__(
@@ -148,8 +150,10 @@ class PlantClient:
         controller: str = "controller",
         disturbance: str = "disturbance",
         watch: bool = True,
+        joints: tuple[str, ...] = ONE_JOINT.names,
     ) -> None:
         node = orchestrator.node
+        self._joints = joints
         self.orchestrator = orchestrator
         # Names in the root namespace begin with one slash, too.
         self.namespace = namespace = namespace.rstrip("/")
@@ -227,10 +231,11 @@ class PlantClient:
 
     def _has_state(self) -> bool:
         if self.sample is None and self._foreign_joints:
-            found = ", ".join(self._foreign_joints)
+            found, ours = ", ".join(self._foreign_joints), ", ".join(self._joints)
+            expected = "the one of a pendulum" if len(self._joints) == 1 else "those of the plant"
             raise FaultError(
-                f"{self.namespace} has the joint{'s' * (len(self._foreign_joints) > 1)} {found}; expected the one of a "
-                f"pendulum, {names.JOINT}"
+                f"{self.namespace} has the joint{'s' * (len(self._foreign_joints) > 1)} {found}; expected {expected}, "
+                f"{ours}"
             )
         return self.sample is not None
 
@@ -365,9 +370,9 @@ class PlantClient:
             self.events.append(event)
 
     def _on_state(self, data: bytes, _received_ns: int) -> None:
-        sample = sample_from_bytes(data)
+        sample = sample_from_bytes(data, self._joints)
         if sample is None:
-            self._foreign_joints = stamp_of_state(data, (names.JOINT,))[1]
+            self._foreign_joints = stamp_of_state(data, self._joints)[1]
         else:
             self.sample = sample
             self._heard = self.orchestrator.listened

@@ -10,7 +10,16 @@ import typer
 if TYPE_CHECKING:
     from pendulum_bags.experiments.simulation import ForeignSimulation
 
-__all__ = ["AcceptDifferences", "MappingFile", "SimulatedPlant", "Simulation", "Strategy", "equation_file"]
+__all__ = [
+    "AcceptDifferences",
+    "AnySimulation",
+    "HardwareMapping",
+    "MappingFile",
+    "SimulatedPlant",
+    "Simulation",
+    "Strategy",
+    "equation_file",
+]
 
 SimulatedPlant = Annotated[
     str | None,
@@ -22,6 +31,14 @@ SimulatedPlant = Annotated[
 Simulation = Annotated[
     str, typer.Option(help="In the simulator's place: a model file (MJCF or URDF, run by MuJoCo), or gymnasium:ID.")
 ]
+AnySimulation = Annotated[
+    str,
+    typer.Option(
+        help="In the simulator's place: a model file (MJCF or URDF, run by MuJoCo), gymnasium:ID, or ros:/NAMESPACE "
+        "for a plant that runs already on --domain; that one needs --plant, too."
+    ),
+]
+HardwareMapping = Annotated[Path | None, typer.Option(help="Mapping file of a simulation that --hardware names.")]
 MappingFile = Annotated[
     Path | None, typer.Option(help="Mapping file of that simulation: joint, actuator, sign, zero, limit.")
 ]

@@ -32,16 +32,18 @@ from pendulum_sim.simulator.engines import GYMNASIUM_PREFIX
 
 __all__ = [
     "HARDWARE",
+    "MODEL_FILES",
     "RAMP_SPEED",
     "RAMP_SPEEDS",
     "SETTLE_TIME",
     "TIME_WITHOUT_NOISE",
     "NoiseSettings",
     "RegulationSettings",
+    "Sides",
 ]
 
 HARDWARE = ("emulator", "hebi")
-_MODEL_FILES = (".xml", ".mjcf", ".urdf")
+MODEL_FILES = (".xml", ".mjcf", ".urdf")
 DEFAULT_STRATEGY = "direct_pwm"
 SETTLE_TIME = 1.0
 """Time under control before the noise starts [s]."""
@@ -84,8 +86,72 @@ class NoiseSettings:
             raise ParameterError(f"seed is {self.seed}; expected >= 0")
 
 
+class Sides:
+    """The two sides of an experiment: simulator, third-party simulations, emulated or real hardware, running plants.
+
+    Attributes:
+        simulation: A third-party simulation: a model file, ``gymnasium:ID``, or ``ros:/namespace`` for one that runs
+            already; empty for the simulator.
+        mapping: Its mapping file; empty for none.
+        hardware: ``emulator``, ``hebi``, or a second simulation or running plant, named likewise.
+        hardware_mapping: Mapping file of a simulation in the hardware's place; empty for none.
+    """
+
+    simulation: str
+    mapping: str
+    hardware: str
+    hardware_mapping: str
+
+    def plant_of(self, side: str) -> str:
+        """Return the preset or file of a side's simulation of several joints; empty for one."""
+        return ""
+
+    def _check_sides(self, hold_time: float) -> None:
+        by_name = self.hardware in HARDWARE or self.hardware.startswith((PREFIX, GYMNASIUM_PREFIX))
+        if not by_name and Path(self.hardware).suffix.lower() not in MODEL_FILES:
+            raise ParameterError(
+                f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}, a model file "
+                f"({', '.join(MODEL_FILES)}), gymnasium:ID or ros:/NAMESPACE"
+            )
+        for side, mapping, option in (("sim", self.mapping, "simulation"), ("hw", self.hardware_mapping, "hardware")):
+            if (foreign := self.foreign_of(side)) is not None:
+                foreign.check(hold_time)
+            elif mapping:
+                raise ParameterError(
+                    f"mapping is {mapping} without a simulation; expected --{option} FILE or gymnasium:ID too"
+                )
+        if self.namespace("sim") == self.namespace("hw"):
+            raise ParameterError(f"both plants are in {self.namespace('sim')}; expected two namespaces")
+
+    @property
+    def foreign(self) -> ForeignSimulation | None:
+        """The third-party simulation of the side sim; None for the built-in one and for one that runs already."""
+        return self.foreign_of("sim")
+
+    def foreign_of(self, side: str) -> ForeignSimulation | None:
+        """Return the third-party simulation of a side, ``sim`` or ``hw``, or None."""
+        name, mapping = (self.simulation, self.mapping) if side == "sim" else (self.hardware, self.hardware_mapping)
+        if not name or name in HARDWARE or name.startswith(PREFIX):
+            return None
+        return ForeignSimulation(name, mapping, self.plant_of(side))
+
+    def running(self, side: str) -> str | None:
+        """Return the namespace of a side's running plant; None if the experiment starts it."""
+        return running_namespace(self.simulation if side == "sim" else self.hardware)
+
+    def namespace(self, side: str) -> str:
+        """Return the namespace of one side's plant."""
+        return self.running(side) or f"/{side}"
+
+    @property
+    def can_repeat(self) -> bool:
+        """Whether both sides can be recorded again with new noise, in lockstep and without an operator."""
+        is_surrogate = self.hardware == "emulator" or self.foreign_of("hw") is not None
+        return is_surrogate and self.running("sim") is None
+
+
 @dataclass(frozen=True)
-class RegulationSettings:
+class RegulationSettings(Sides):
     """Regulation of the upright pendulum under noise, on simulator and hardware, as in the thesis.
 
     Attributes:
@@ -127,12 +193,6 @@ class RegulationSettings:
             load_policy(self.controller)
         require_one_joint(self.plant, f"python -m pendulum_bags experiment joints --plant {self.plant}")
         object.__setattr__(self, "method", integrator_of(self.plant, self.method))
-        by_name = self.hardware in HARDWARE or self.hardware.startswith((PREFIX, GYMNASIUM_PREFIX))
-        if not by_name and Path(self.hardware).suffix.lower() not in _MODEL_FILES:
-            raise ParameterError(
-                f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}, a model file "
-                f"({', '.join(_MODEL_FILES)}), gymnasium:ID or ros:/NAMESPACE"
-            )
         machine = real_machine(self.hardware, self.lab)
         slowest, fastest = RAMP_SPEEDS
         if not slowest <= self.ramp_speed <= fastest:
@@ -144,19 +204,11 @@ class RegulationSettings:
                 f"ramp speed is {self.ramp_speed:g} rad/s, with up to {largest:g} rad/s; expected up to "
                 f"{_LARGEST_OF_LIMIT * limit:g} rad/s at a velocity limit of {limit:g} rad/s (lab file)"
             )
-        for side, mapping, option in (("sim", self.mapping, "simulation"), ("hw", self.hardware_mapping, "hardware")):
-            if (foreign := self.foreign_of(side)) is not None:
-                foreign.check(self.noise.hold_time)
-            elif mapping:
-                raise ParameterError(
-                    f"mapping is {mapping} without a simulation; expected --{option} FILE or gymnasium:ID too"
-                )
+        self._check_sides(self.noise.hold_time)
         if self.hardware not in HARDWARE and self.effort_strategy:
             raise ParameterError(
                 f"strategy is {self.effort_strategy} for hardware {self.hardware}, which has none; expected it left out"
             )
-        if self.namespace("sim") == self.namespace("hw"):
-            raise ParameterError(f"both plants are in {self.namespace('sim')}; expected two namespaces")
         defaults = {item.name: item.default for item in fields(self)}
         for name in ("q", "r"):
             if getattr(self, name) != defaults[name] and name not in self.tuning:
@@ -183,32 +235,6 @@ class RegulationSettings:
         if self.kind == "policy":
             given["policy"] = str(Path(self.controller).expanduser().resolve())
         return {name: value for name, value in given.items() if name in known}
-
-    @property
-    def foreign(self) -> ForeignSimulation | None:
-        """The third-party simulation of the side sim; None for the built-in one and for one that runs already."""
-        return self.foreign_of("sim")
-
-    def foreign_of(self, side: str) -> ForeignSimulation | None:
-        """Return the third-party simulation of a side, ``sim`` or ``hw``, or None."""
-        name, mapping = (self.simulation, self.mapping) if side == "sim" else (self.hardware, self.hardware_mapping)
-        if not name or (side == "hw" and name in HARDWARE) or name.startswith(PREFIX):
-            return None
-        return ForeignSimulation(name, mapping)
-
-    def running(self, side: str) -> str | None:
-        """Return the namespace of a side's running plant; None if the experiment starts it."""
-        return running_namespace(self.simulation if side == "sim" else self.hardware)
-
-    def namespace(self, side: str) -> str:
-        """Return the namespace of one side's plant."""
-        return self.running(side) or f"/{side}"
-
-    @property
-    def can_repeat(self) -> bool:
-        """Whether both sides can be recorded again with new noise, in lockstep and without an operator."""
-        is_surrogate = self.hardware == "emulator" or self.foreign_of("hw") is not None
-        return is_surrogate and self.running("sim") is None
 
     @property
     def is_emulated(self) -> bool:

@@ -11,12 +11,15 @@ from typing import Any
 import numpy as np
 
 from pendulum_bags.runs.case import identity_of
-from pendulum_bags.runs.read_recording import read_recording
 from pendulum_bags.runs.run_record import DIFFERENCE
+from pendulum_msgs_py.contract import names
+from pendulum_msgs_py.contract.names import Event
+from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_differences import describe_plants
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant, write_plant
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism, write_plant
 from pendulum_msgs_py.programs.graph import NodeProgram, ParameterArgument
+from pendulum_rosbag.reader import read_bag
 from pendulum_sim.foreign.equation_check import TOLERANCE, EquationCheck, check_recording
 from pendulum_sim.simulator.engines import find_engine, open_simulation
 from pendulum_sim.stepping.plants import JointPlant, make_plant
@@ -153,24 +156,42 @@ def absolute_plant(plant: str) -> str:
 
 
 def recorded_difference(bag: Path, namespace: str, plant: str) -> str:
-    """Return how far a running plant followed its equation, if it moved; a DataError without states."""
-    recording = read_recording(bag, namespace=namespace)
-    period = float(np.median(np.diff(recording.time)))
-    times = np.arange(recording.time[0], recording.time[-1], period)
-    velocity = np.gradient(recording.position, recording.time) if recording.velocity is None else recording.velocity
-    motion = [np.interp(times, recording.time, values)[:, None] for values in (recording.position, velocity)]
-    held = np.maximum(np.searchsorted(recording.input_stamps, times + 1e-9, side="right") - 1, 0)
-    effort = recording.input[held][:, None]
-    parameters = load_plant(plant)
+    """Return how far a running plant followed its equation, if it moved; a DataError without states.
+
+    Of several joints, which are held by hand before the noise and fall after it, the noise alone counts.
+    """
+    parameters = load_mechanism(plant)
+    with read_bag(bag) as opened:
+        states = opened.joints(f"{namespace}/{names.JOINT_STATES}")
+        efforts = opened.joints(f"{namespace}/{names.APPLIED_EFFORT}")
+        marks = {event["name"]: int(event["stamp_ns"]) for event in opened.events()}
+    stamps = states.stamp_ns
+    begin, end = int(stamps[0]), int(stamps[-1])
+    if not parameters.is_pendulum:
+        begin, end = marks.get(Event.NOISE_START, begin), marks.get(Event.NOISE_END, end)
+    seconds = (stamps - begin) / NANOSECONDS
+    period = float(np.median(np.diff(seconds)))
+    times = np.arange(0.0, (end - begin) / NANOSECONDS, period)
+    position, velocity = (
+        np.stack([np.interp(times, seconds, column) for column in values.T], axis=1)
+        for values in (states.position, states.velocity)
+    )
+    held = np.searchsorted((efforts.stamp_ns - begin) / NANOSECONDS, times + 1e-9, side="right") - 1
+    effort = efforts.effort[np.maximum(held, 0)]
     substeps = None if parameters.drivetrain is not None else math.ceil(period / 1e-3)
-    errors = check_recording(motion[0], motion[1], effort, make_plant(parameters, period, substeps=substeps))
+    errors = check_recording(position, velocity, effort, make_plant(parameters, period, substeps=substeps))
     if not errors.size:
         return f"{namespace} ran already, and its recording is too short to check {plant} against it."
-    error = float(np.quantile(errors, _PIECES))
+    error = float(np.quantile(errors.max(axis=1), _PIECES))
     verb = "agrees with" if error <= TOLERANCE else "DIFFERS FROM"
+    spans = ", ".join(
+        f"{f'{joint.name} ' if len(position.T) > 1 else ''}{np.min(q):.2f} to {np.max(q):.2f} {joint.unit}, up to "
+        f"{np.max(np.abs(v)):.2g} {joint.velocity_unit}"
+        for joint, q, v in zip(parameters.mechanism.joints, position.T, velocity.T, strict=True)
+    )
     return (
         f"{namespace} ran already and could be put nowhere: only its recording was compared with {plant}. It {verb} "
         f"that equation within {100.0 * error:.2g} % of its motion (at most {100.0 * TOLERANCE:g} %) in nine of ten "
-        f"pieces, at {np.min(motion[0]):.2f} to {np.max(motion[0]):.2f} rad, up to "
-        f"{np.max(np.abs(motion[1])):.2g} rad/s and {np.max(np.abs(effort)):.2g} N m; nothing beyond was checked."
+        f"pieces, at {spans} and {np.max(np.abs(effort)):.2g} {parameters.coordinates.drive_unit}; nothing beyond was "
+        "checked."
     )

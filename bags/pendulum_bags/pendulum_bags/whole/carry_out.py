@@ -22,13 +22,14 @@ from typing import TypeVar
 from pendulum_bags.comparison import Comparison, Margins
 from pendulum_bags.experiments.deadline import BudgetSpentError, Deadline
 from pendulum_bags.experiments.decide import decide
+from pendulum_bags.experiments.held import record_held
 from pendulum_bags.experiments.joint_run import JointSettings, design_file, require_upright
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.machine import Machine, MachineRun
 from pendulum_bags.experiments.processes import Child, ProcessSet
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.repeats import SHORTEST, record_repeat, record_simulation, repeat_folder, repeat_settings
-from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.experiments.run_spec import SIDES, RunSpec
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.experiments.simulation import recorded_difference
 from pendulum_bags.experiments.stalls import run_undisturbed
@@ -254,7 +255,7 @@ class _Run:
         self.tested = _under_other_noise(settings)
         self.contenders: dict[str, list[tuple[RunSpec, RunSpec]]] = {}
         runs: list[MachineRun] = []
-        if isinstance(settings, JointSettings):
+        if isinstance(settings, JointSettings) and settings.hardware == "emulator":
             runs.append(MachineRun(folder / "hw", lockstep_spec(settings, side="hw")))
         if not order.alone:
             sim, hw = (lockstep_spec(settings, side=side) for side in ("sim", "hw"))
@@ -281,16 +282,7 @@ class _Run:
         """Make the first recordings."""
         settings = self.order.settings
         if isinstance(settings, JointSettings):
-            self._phase("noise on the simulation", 0.1 * settings.noise.duration)
-            self.machine.start()
-            record_simulation(self.folder / "sim", lockstep_spec(settings, side="sim"))
-            self._phase("noise on the hardware", 4.0 + 0.15 * settings.noise.duration)
-            stopped = ""
-            try:
-                self.machine.wait(self.folder / "hw")
-            except PlantStoppedError as error:
-                stopped = f"went to {error.mode} ({error.reason})"
-            require_upright(self.folder, settings, stopped)
+            self._measure_joints(settings, leaving)
             return
 
         def run() -> None:
@@ -309,6 +301,26 @@ class _Run:
                 raise
 
         run_undisturbed(run, self.folder, emulated=settings.is_emulated, tell=self.progress.start_again)
+
+    def _measure_joints(self, settings: JointSettings, leaving: ExitStack) -> None:
+        """Make the first recordings of a plant of several joints: in lockstep, or as it is held upright."""
+        words = {"sim": "the simulation", "hw": "the simulation in the hardware's place"}
+        for side in SIDES:
+            if settings.running(side) is not None:
+                record_held(self.folder / side, settings, side, self.order.domain, self.progress, leaving)
+        self.machine.start()
+        stopped = ""
+        for side in SIDES:
+            if (side == "sim" and settings.running("sim") is None) or settings.foreign_of(side) is not None:
+                self._phase(f"noise on {words[side]}", 0.1 * settings.noise.duration)
+                record_simulation(self.folder / side, lockstep_spec(settings, side=side))
+        if settings.hardware == "emulator":
+            self._phase("noise on the hardware", 4.0 + 0.15 * settings.noise.duration)
+            try:
+                self.machine.wait(self.folder / "hw")
+            except PlantStoppedError as error:
+                stopped = f"went to {error.mode} ({error.reason})"
+        require_upright(self.folder, settings, stopped)
 
     def compare_given(self) -> None:
         """Compare the given plant with the machine."""
@@ -486,6 +498,9 @@ class _Run:
 def _undefined(settings: Settings) -> list[LayerResult]:
     if not isinstance(settings, JointSettings):
         return []
+    if not settings.can_repeat:
+        why = "Not measured: a plant that runs already moves once, under one controller."
+        return [LayerResult(layer, Mark.NOT_MEASURED, why) for layer in Layer if layer is not Layer.SAME_RUN]
     driven = len(load_mechanism(settings.plant).effort_limits)
     why = f"Not defined: {driven} joints are driven, and frequencies are measured where one is."
     layers = (Layer.SAME_PLANT, Layer.WHICH_CONTROLLERS) if driven > 1 else ()
@@ -501,15 +516,13 @@ def _under_other_noise(settings: _Settings) -> _Settings:
 def _with_plant(settings: Settings, file: Path) -> Settings:
     """Return the settings for a plant file under the controller of the given plant."""
     if isinstance(settings, JointSettings):
-        return replace(settings, plant=str(file), design=settings.design_plant)
+        settings = replace(settings, machine=settings.plant_of("hw"))
     return replace(settings, plant=str(file), design=settings.design_plant, simulation="", mapping="")
 
 
 def _of(plant: Simulated, spec: RunSpec) -> RunSpec:
     """Return a run of the given plant's simulation as one of another plant with the same controller."""
     settings = plant.settings
-    if isinstance(settings, JointSettings):
-        return replace(spec, plant=settings.plant)
     return replace(
         spec, plant=settings.plant, method=settings.method, simulation=settings.simulation, mapping=settings.mapping
     )
