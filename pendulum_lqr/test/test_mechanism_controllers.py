@@ -7,14 +7,11 @@ import math
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 import pytest
 
 from pendulum_lqr.controller_interface.controller import make_controller
-from pendulum_lqr.controller_interface.interface import Controller
-from pendulum_lqr.controllers.mechanism_controllers import DifferencedVelocity, make_mechanism_controller
 from pendulum_lqr.linear.design import DesignError, output_lqr
 from pendulum_lqr.linear.model import linearise
 from pendulum_lqr.swing_up import mechanism_catch, swing_up_cli
@@ -31,7 +28,7 @@ from pendulum_lqr.swing_up.mechanism_trajectory import (
     write_trajectory,
 )
 from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr
-from pendulum_lqr.swing_up.stored_swing_up import default_catch, stored_trajectory
+from pendulum_lqr.swing_up.stored_swing_up import default_catch, stored_trajectory, tracked_swing_up
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.runge_kutta import along_2, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
@@ -108,8 +105,7 @@ def test_the_catch_takes_over_within_its_region_and_releases_beyond_twice_that()
 @pytest.mark.parametrize("name", ["acrobot_frictionless", "pendubot_frictionless"])
 def test_tracking_brings_a_disturbed_swing_up_upright_and_open_loop_does_not(name: str) -> None:
     plant = load_mechanism(name)
-    controller = make_mechanism_controller("tvlqr", plant, DT)
-    assert isinstance(controller, MechanismTvlqr)
+    controller = tracked_swing_up(plant, DT)
     feedback: Vector = (0.02, -0.02, 0.0, 0.0)
     open_loop = feedback
     for k in range(2500):
@@ -342,9 +338,6 @@ def test_a_swing_up_that_its_lqr_would_not_hold_at_this_period_is_refused() -> N
     tardy = make_controller("nmpc", delayed_plant("cart_pole", 0.05), 0.05)
     with pytest.raises(ParameterError, match=r"nmpc asked every 0\.059 s does not settle on plant 'cart_pole'"):
         tardy.check(0.059)
-    # The same where it is made for whole states.
-    with pytest.raises(ParameterError, match=r"tvlqr asked every 0\.002 s does not settle on plant 'acrobot_frict"):
-        make_mechanism_controller("tvlqr", delayed_plant("acrobot_frictionless", 0.3), DT)
 
 
 @pytest.mark.timeout(400)
@@ -441,26 +434,6 @@ def test_a_search_whose_file_cannot_be_written_ends_before_it_begins(
     assert "file/x.json cannot be written: " in capsys.readouterr().err
 
 
-def test_velocities_from_positions_are_the_true_ones_whatever_was_measured() -> None:
-    plant = load_mechanism("acrobot_frictionless")
-
-    class Listener(Controller):
-        heard: ClassVar[list[Vector]] = []
-
-        def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
-            self.heard.append(position + velocity)
-            return (2.0 * math.sin(9.0 * t),)
-
-    listener = Listener(plant.effort_limits)
-    controller = DifferencedVelocity(plant, listener)
-    x: Vector = (0.1, 0.4, 0.0, 0.0)
-    for k in range(500):
-        noise = 0.5 * (-1) ** k if k else 0.0
-        effort = controller.efforts(k * DT, x[:2], (x[2] + noise, x[3] - noise))
-        assert listener.heard[-1] == pytest.approx(x, rel=1e-3, abs=2e-3)
-        x = step(plant, x, effort)
-
-
 def test_a_trajectory_file_gives_back_what_was_written_and_says_what_is_wrong_with_another(tmp_path: Path) -> None:
     trajectory = stored_trajectory(load_mechanism("acrobot_frictionless"))
     write_trajectory(tmp_path / "again.json", trajectory)
@@ -491,5 +464,3 @@ def test_a_trajectory_file_gives_back_what_was_written_and_says_what_is_wrong_wi
     catch = default_catch(plant)
     with pytest.raises(ParameterError, match="has the joints shoulder, elbow and 1 motors; expected cart, pole and 1"):
         MechanismTvlqr(DT, trajectory, catch, q=Q, r=R)
-    with pytest.raises(ParameterError, match="controller 'lqr' is unknown; expected one of tvlqr"):
-        make_mechanism_controller("lqr", load_mechanism("acrobot_frictionless"), DT)

@@ -15,6 +15,7 @@ from typer.testing import CliRunner
 
 from pendulum_bags.commands.experiment_cli import app
 from pendulum_bags.studies import mechanism_benchmark_runs as runs
+from pendulum_bags.studies.benchmark_controllers import DifferencedVelocity, make_contender
 from pendulum_bags.studies.mechanism_benchmark import (
     PUBLISHED,
     benchmark_plant,
@@ -24,11 +25,12 @@ from pendulum_bags.studies.mechanism_benchmark import (
 )
 from pendulum_bags.studies.mechanism_benchmark_runs import Disturbances, Trial, robustness_of, robustness_trials
 from pendulum_lqr.controller_interface.interface import Controller
-from pendulum_lqr.controllers.mechanism_controllers import make_mechanism_controller
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.contract.joints import Vector
+from pendulum_msgs_py.dynamics.runge_kutta import along_2, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_testing.joint_plants import delayed_plant
 from pendulum_testing.policies import random_policy
 
 T = 0.002 * np.arange(5000)
@@ -203,11 +205,46 @@ def test_a_policy_file_is_scored_with_an_lqr_near_upright_and_without(tmp_path) 
     assert rows[0]["criteria"]["torque_cost"] > 0.0
     # It never comes near upright: nothing is caught, both do the same.
     assert rows[0]["criteria"] == rows[1]["criteria"]
-    answers = make_mechanism_controller(f"{file}+lqr", plant, 0.002), make_mechanism_controller(str(file), plant, 0.002)
+    answers = make_contender(f"{file}+lqr", plant, 0.002), make_contender(str(file), plant, 0.002)
     near = (math.pi + 0.02, -0.01, 0.0, 0.05)
     caught, bare = (controller.efforts(0.0, near[:2], near[2:]) for controller in answers)
     assert caught != bare
     with pytest.raises(ParameterError, match="trained on a double_pendulum driven at shoulder, and this one is"):
-        make_mechanism_controller(str(file), benchmark_plant("acrobot"), 0.002)
+        make_contender(str(file), benchmark_plant("acrobot"), 0.002)
     with pytest.raises(DesignError, match=r"trained for a period of 0\.01 s and states come every 0\.003 s"):
-        make_mechanism_controller(str(file), plant, 0.003)
+        make_contender(str(file), plant, 0.003)
+
+
+def test_velocities_from_positions_are_the_true_ones_whatever_was_measured() -> None:
+    plant, period = benchmark_plant("acrobot"), 0.002
+
+    class Listener(Controller):
+        def __init__(self) -> None:
+            super().__init__(plant.effort_limits)
+            self.heard: list[Vector] = []
+
+        def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
+            self.heard.append(position + velocity)
+            return (2.0 * math.sin(9.0 * t),)
+
+    listener = Listener()
+    controller = DifferencedVelocity(plant, listener)
+    x: Vector = (0.1, 0.4, 0.0, 0.0)
+    for k in range(500):
+        noise = 0.5 * (-1) ** k if k else 0.0
+        effort = controller.efforts(k * period, x[:2], (x[2] + noise, x[3] - noise))
+        assert listener.heard[-1] == pytest.approx(x, rel=1e-3, abs=2e-3)
+        torque = plant.coordinates.spread(effort)
+        q, v = rk4_joints(plant.mechanism.forward, along_2, x[:2], x[2:], torque, torque, torque, period, plant.packed)
+        x = (*q, *v)
+
+
+def test_a_contender_that_does_not_settle_or_that_nobody_knows_is_refused_and_old_names_are_known() -> None:
+    plant = benchmark_plant("acrobot")
+    late = delayed_plant("acrobot_frictionless", 0.3)
+    with pytest.raises(ParameterError, match=r"tvlqr asked every 0\.002 s does not settle on plant 'acrobot_frict"):
+        make_contender("tvlqr", late, 0.002)
+    with pytest.raises(ParameterError, match="controller 'lqr' is unknown; expected one of tvlqr"):
+        make_contender("lqr", plant, 0.002)
+    old, new = (make_contender(name, plant, 0.002) for name in ("tvlqr_mpc", "tvlqr_nmpc"))
+    assert type(old) is type(new)

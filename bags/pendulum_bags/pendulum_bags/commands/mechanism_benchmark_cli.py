@@ -51,14 +51,14 @@ def benchmark(
     Example: python -m pendulum_bags experiment benchmark --plant pendubot --controller tvlqr --no-robustness
     """
     from pendulum_bags.runs.run_folder import write_json
+    from pendulum_bags.studies.benchmark_controllers import contender_names
     from pendulum_bags.studies.mechanism_benchmark import PUBLISHED, benchmark_plant
     from pendulum_bags.studies.mechanism_benchmark_figure import write_swing_up_figure
     from pendulum_bags.studies.mechanism_benchmark_runs import robustness_trials
     from pendulum_bags.studies.mechanism_benchmark_table import Bench, document, prepare, run_job, score_rows
-    from pendulum_lqr.controllers.mechanism_controllers import mechanism_controller_names
 
     model = benchmark_plant(plant)
-    names = [each.strip() for each in controller.split(",") if each.strip()] or list(mechanism_controller_names())
+    names = [each.strip() for each in controller.split(",") if each.strip()] or list(contender_names())
     console = make_console(stderr=json_output, highlight=False)
     trials = robustness_trials(model, seed) if robustness else []
     jobs = [("swing_up", name, 0) for name in names]

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pendulum_bags.studies.benchmark_controllers import make_contender
 from pendulum_bags.studies.mechanism_benchmark import benchmark_plant
 from pendulum_bags.studies.mechanism_benchmark_runs import (
     DT,
@@ -23,7 +24,6 @@ from pendulum_bags.studies.mechanism_benchmark_runs import (
     try_once,
 )
 from pendulum_lqr.controller_interface.interface import Controller
-from pendulum_lqr.controllers.mechanism_controllers import make_mechanism_controller
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["Bench", "Job", "Row", "document", "prepare", "run_job", "score_rows"]
@@ -74,7 +74,7 @@ class _Prepared:
 def prepare(bench: Bench) -> _Prepared:
     """Design the controllers and compile the simulation, once in a process."""
     model = benchmark_plant(bench.plant)
-    controllers = {name: make_mechanism_controller(name, model, DT) for name in bench.names}
+    controllers = {name: make_contender(name, model, DT) for name in bench.names}
     stepper = make_stepper(model, compiled=bench.compiled)
     return _Prepared(model, stepper, controllers, robustness_trials(model, bench.seed))
 

@@ -1,4 +1,4 @@
-"""Controllers of plants of several joints by name, each for any mechanism."""
+"""The benchmark's contenders: controllers that get whole states, with velocities of their own where it gives none."""
 
 from __future__ import annotations
 
@@ -19,8 +19,10 @@ from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["DifferencedVelocity", "make_mechanism_controller", "mechanism_controller_names"]
+__all__ = ["DifferencedVelocity", "contender_names", "make_contender"]
 
+_OLD_NAMES = {"mpc": "nmpc", "tvlqr_mpc": "tvlqr_nmpc"}
+"""Accepted until the next release."""
 _CATCH_SUFFIX = "+lqr"
 """Suffix of a policy file's name for an LQR that takes over near upright."""
 
@@ -59,28 +61,28 @@ class DifferencedVelocity(Controller):
         return self._effort
 
 
-def _tvlqr_mpc(plant: PlantParameters, period: float) -> Controller:
+def _tvlqr_nmpc(plant: PlantParameters, period: float) -> Controller:
     return DifferencedVelocity(plant, tracked_swing_up(plant, period, recovers=True))
 
 
 _CONTROLLERS: dict[str, Callable[[PlantParameters, float], Controller]] = {
     "tvlqr": tracked_swing_up,
     "ilqr": lambda plant, period: PlannedSwingUp(period, default_catch(plant)),
-    "mpc": lambda plant, period: DifferencedVelocity(plant, MechanismMpc(period, default_catch(plant))),
-    "tvlqr_mpc": _tvlqr_mpc,
+    "nmpc": lambda plant, period: DifferencedVelocity(plant, MechanismMpc(period, default_catch(plant))),
+    "tvlqr_nmpc": _tvlqr_nmpc,
 }
 
 
-def mechanism_controller_names() -> tuple[str, ...]:
-    """Return the names of all controllers of plants of several joints."""
+def contender_names() -> tuple[str, ...]:
+    """Return the names of all contenders."""
     return tuple(_CONTROLLERS)
 
 
-def make_mechanism_controller(name: str, plant: PlantParameters, period: float) -> Controller:
-    """Design a controller; ilqr and mpc compile for some ten seconds the first time.
+def make_contender(name: str, plant: PlantParameters, period: float) -> Controller:
+    """Design a controller; ilqr and nmpc compile for some ten seconds the first time.
 
     Args:
-        name: Of :func:`mechanism_controller_names`, or the path of a policy file, ``FILE.npz``; with ``FILE.npz+lqr``
+        name: Of :func:`contender_names`, or the path of a policy file, ``FILE.npz``; with ``FILE.npz+lqr``
             an LQR takes over near upright.
         plant: Plant of its model.
         period: Sampling period [s].
@@ -101,6 +103,7 @@ def make_mechanism_controller(name: str, plant: PlantParameters, period: float) 
         inner = LearnedPolicy(policy, hold, plant.effort_limits, start_time=0.0, catch=catch)
         inner.check(period)
         return inner
+    name = _OLD_NAMES.get(name, name)
     if name not in _CONTROLLERS:
         raise ParameterError(
             f"controller {name!r} is unknown; expected one of {', '.join(_CONTROLLERS)}, or a policy file (.npz)"
