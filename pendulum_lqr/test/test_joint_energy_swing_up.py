@@ -11,9 +11,9 @@ from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.joint_energy_swing_up import JointEnergySwingUp
 from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.swing_up.catch import make_mechanism_catch
 from pendulum_lqr.swing_up.energy_margin import EnergyMargin
-from pendulum_lqr.swing_up.mechanism_catch import make_mechanism_catch
-from pendulum_lqr.swing_up.mechanism_pump import EnergyPump, pump_gains
+from pendulum_lqr.swing_up.pump import EnergyPump, pump_gains
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
@@ -200,9 +200,7 @@ def test_a_period_that_is_measured_later_is_judged_without_another_design(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     controller = make_controller(name, load_mechanism("cart_pole"), 0.01, checked=False)
-    monkeypatch.setattr(
-        "pendulum_lqr.swing_up.mechanism_catch.sample_caught_region", lambda *_: pytest.fail("designed again")
-    )
+    monkeypatch.setattr("pendulum_lqr.swing_up.catch.sample_caught_region", lambda *_: pytest.fail("designed again"))
     monkeypatch.setattr("pendulum_lqr.controllers.lqr.output_lqr", lambda *_: pytest.fail("designed again"))
     controller.check(0.01)
     with pytest.raises(ParameterError, match=rf"{name} asked every 0\.5 s does not settle on plant 'cart_pole'"):

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 from pendulum_lqr.controllers.joint_energy_swing_up import JointEnergySwingUp, _bounded
 from pendulum_lqr.linear.design import DesignError, output_lqr
 from pendulum_lqr.linear.model import linearise
-from pendulum_lqr.swing_up.mechanism_catch import CaughtRegion, MechanismCatch
-from pendulum_lqr.swing_up.mechanism_pump import EnergyPump, PumpGains, pump_gains
+from pendulum_lqr.swing_up.catch import CaughtRegion, MechanismCatch
+from pendulum_lqr.swing_up.pump import EnergyPump, PumpGains, pump_gains
 from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism

@@ -20,7 +20,7 @@ from pendulum_learning.teacher import Teacher
 from pendulum_learning.train_cli import main
 from pendulum_learning.training import Training, checkpoint_path, train
 from pendulum_lqr.policies.policy_file import load_policy
-from pendulum_lqr.swing_up.mechanism_catch import deviation_of
+from pendulum_lqr.swing_up.catch import deviation_of
 from pendulum_testing.policies import random_policy
 
 PENDUBOT = benchmark_plant("pendubot")

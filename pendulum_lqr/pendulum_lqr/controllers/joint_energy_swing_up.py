@@ -11,9 +11,9 @@ from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controllers.linear_feedback import JOINT_LIMIT, joint_limits, require_catching
 from pendulum_lqr.controllers.specs import CATCH_Q, CATCH_R, CATCH_SHARE
 from pendulum_lqr.linear.design import DesignError
+from pendulum_lqr.swing_up.catch import MechanismCatch, deviation_of, make_mechanism_catch
 from pendulum_lqr.swing_up.energy_margin import EnergyMargin
-from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
-from pendulum_lqr.swing_up.mechanism_pump import EnergyPump, pump_gains
+from pendulum_lqr.swing_up.pump import EnergyPump, pump_gains
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -27,7 +27,7 @@ _REST = 0.1
 class JointEnergySwingUp(Controller):
     """Pumps energy into a pendulum by moving its hinge until the LQR can catch it.
 
-    The law is that of :mod:`pendulum_lqr.swing_up.mechanism_pump`. It plans nothing, and a command takes microseconds:
+    The law is that of :mod:`pendulum_lqr.swing_up.pump`. It plans nothing, and a command takes microseconds:
     it starts from any state, also after a push. ``margin`` is the target energy beyond upright, as a share of it [-].
     """
 

@@ -7,10 +7,10 @@ from typing import Any
 
 from pendulum_lqr.controllers.joint_swing_up import JointSwingUp
 from pendulum_lqr.controllers.linear_feedback import JOINT_LIMIT, joint_limits
-from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, make_mechanism_catch
-from pendulum_lqr.swing_up.mechanism_ilqr import IlqrWeights
-from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory, SwingUpSearch, cheapest_swing_up
+from pendulum_lqr.swing_up.catch import MechanismCatch, make_mechanism_catch
+from pendulum_lqr.swing_up.ilqr import IlqrWeights
 from pendulum_lqr.swing_up.stored_swing_up import refuse_passive_friction
+from pendulum_lqr.swing_up.trajectory import MechanismTrajectory, SwingUpSearch, cheapest_swing_up
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 

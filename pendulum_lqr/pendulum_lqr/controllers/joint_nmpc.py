@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pendulum_lqr.controllers.joint_swing_up import CaughtController
-from pendulum_lqr.swing_up.mechanism_mpc import PLAN, MechanismMpc
+from pendulum_lqr.swing_up.mpc import PLAN, MechanismMpc
 from pendulum_lqr.swing_up.stored_swing_up import default_catch, refuse_passive_friction
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 

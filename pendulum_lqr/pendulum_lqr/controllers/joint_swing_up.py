@@ -9,11 +9,11 @@ from typing import Any, ClassVar
 from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controller_interface.sampling import require_period
 from pendulum_lqr.controllers.linear_feedback import require_catching
-from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch
-from pendulum_lqr.swing_up.mechanism_mpc import MechanismMpc
-from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory, load_trajectory
-from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr
+from pendulum_lqr.swing_up.catch import MechanismCatch
+from pendulum_lqr.swing_up.mpc import MechanismMpc
 from pendulum_lqr.swing_up.stored_swing_up import default_catch, stored_trajectory
+from pendulum_lqr.swing_up.trajectory import MechanismTrajectory, load_trajectory
+from pendulum_lqr.swing_up.tvlqr import MechanismTvlqr
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

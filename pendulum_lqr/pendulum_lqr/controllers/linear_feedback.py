@@ -19,7 +19,7 @@ from pendulum_lqr.controllers.specs import FEEDFORWARD, Q, R
 from pendulum_lqr.linear.analysis import Feedback
 from pendulum_lqr.linear.design import Gain
 from pendulum_lqr.linear.model import linearise
-from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch
+from pendulum_lqr.swing_up.catch import MechanismCatch
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap_angle
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.parameters import ParameterSpec

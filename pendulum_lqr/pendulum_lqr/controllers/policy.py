@@ -19,7 +19,7 @@ from pendulum_lqr.controller_interface.policy_runner import (
 from pendulum_lqr.controllers.linear_feedback import JOINT_LIMIT, joint_limits, require_catching
 from pendulum_lqr.policies.policy import Policy, require_plant
 from pendulum_lqr.policies.policy_file import load_policy
-from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of, make_mechanism_catch
+from pendulum_lqr.swing_up.catch import MechanismCatch, deviation_of, make_mechanism_catch
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec

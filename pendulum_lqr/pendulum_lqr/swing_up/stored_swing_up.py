@@ -5,10 +5,10 @@ from __future__ import annotations
 from importlib import resources
 from pathlib import Path
 
-from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, make_mechanism_catch
-from pendulum_lqr.swing_up.mechanism_mpc import MechanismMpc
-from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory, load_trajectory
-from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr
+from pendulum_lqr.swing_up.catch import MechanismCatch, make_mechanism_catch
+from pendulum_lqr.swing_up.mpc import MechanismMpc
+from pendulum_lqr.swing_up.trajectory import MechanismTrajectory, load_trajectory
+from pendulum_lqr.swing_up.tvlqr import MechanismTvlqr
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 

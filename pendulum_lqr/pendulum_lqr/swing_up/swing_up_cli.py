@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from pendulum_lqr.swing_up.mechanism_ilqr import IlqrWeights
+from pendulum_lqr.swing_up.ilqr import IlqrWeights
 from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import counting_bar
@@ -41,8 +41,8 @@ def swing_up(
 
     Example: python -m pendulum_lqr swing_up --preset pendubot_frictionless --guesses 20 --out build/pendubot.json
     """
-    from pendulum_lqr.swing_up.mechanism_trajectory import SwingUpSearch, cheapest_swing_up, write_trajectory
     from pendulum_lqr.swing_up.stored_swing_up import default_catch
+    from pendulum_lqr.swing_up.trajectory import SwingUpSearch, cheapest_swing_up, write_trajectory
     from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 
     try:

@@ -11,9 +11,9 @@ from pendulum_lqr.controllers.linear_feedback import require_catching
 from pendulum_lqr.controllers.policy import LearnedPolicy
 from pendulum_lqr.policies.policy import require_plant
 from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy
-from pendulum_lqr.swing_up.mechanism_catch import make_mechanism_catch
-from pendulum_lqr.swing_up.mechanism_mpc import MechanismMpc
-from pendulum_lqr.swing_up.mechanism_planned import PlannedSwingUp
+from pendulum_lqr.swing_up.catch import make_mechanism_catch
+from pendulum_lqr.swing_up.mpc import MechanismMpc
+from pendulum_lqr.swing_up.planned import PlannedSwingUp
 from pendulum_lqr.swing_up.stored_swing_up import CALM_WEIGHTS, default_catch, tracked_swing_up
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.errors import ParameterError

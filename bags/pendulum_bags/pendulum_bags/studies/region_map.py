@@ -24,7 +24,7 @@ from pendulum_bags.studies.chunks import Connect, chunk_path, open_results, read
 from pendulum_bags.studies.closed_loops import ClosedLoops, Columns
 from pendulum_lqr.linear.design import DesignError
 from pendulum_lqr.linear.roa import proven_level, sublevel_ellipse
-from pendulum_lqr.swing_up.mechanism_catch import sample_caught_region
+from pendulum_lqr.swing_up.catch import sample_caught_region
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controller_interface.law import within_limits
-from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
-from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrWeights
-from pendulum_lqr.swing_up.mechanism_search import PlanSearch, PlanSettings
+from pendulum_lqr.swing_up.catch import MechanismCatch, deviation_of
+from pendulum_lqr.swing_up.ilqr import IlqrPlan, IlqrWeights
+from pendulum_lqr.swing_up.search import PlanSearch, PlanSettings
 from pendulum_msgs_py.contract.joints import Vector
 
 __all__ = ["ITERATIONS", "PATIENCE", "PLAN", "RETRIES", "MechanismMpc"]

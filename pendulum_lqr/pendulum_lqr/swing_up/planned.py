@@ -7,11 +7,11 @@ import math
 import numpy as np
 
 from pendulum_lqr.controller_interface.interface import Controller
-from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
-from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrWeights
-from pendulum_lqr.swing_up.mechanism_search import PlanSearch, PlanSettings
-from pendulum_lqr.swing_up.mechanism_trajectory import trajectory_of
-from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr, whole_turns
+from pendulum_lqr.swing_up.catch import MechanismCatch, deviation_of
+from pendulum_lqr.swing_up.ilqr import IlqrPlan, IlqrWeights
+from pendulum_lqr.swing_up.search import PlanSearch, PlanSettings
+from pendulum_lqr.swing_up.trajectory import trajectory_of
+from pendulum_lqr.swing_up.tvlqr import MechanismTvlqr, whole_turns
 from pendulum_msgs_py.contract.joints import Vector
 
 __all__ = ["PlannedSwingUp"]

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
-from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
+from pendulum_lqr.swing_up.catch import MechanismCatch, deviation_of
+from pendulum_lqr.swing_up.ilqr import IlqrPlan, IlqrProblem, IlqrWeights
 from pendulum_msgs_py.contract.joints import Vector
 
 __all__ = ["PlanSearch", "PlanSettings"]

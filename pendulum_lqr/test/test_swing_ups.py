@@ -14,21 +14,22 @@ import pytest
 from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.linear.design import DesignError, output_lqr
 from pendulum_lqr.linear.model import linearise
-from pendulum_lqr.swing_up import mechanism_catch, swing_up_cli
-from pendulum_lqr.swing_up.mechanism_catch import CaughtRegion, MechanismCatch, deviation_of, make_mechanism_catch
-from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
-from pendulum_lqr.swing_up.mechanism_mpc import ITERATIONS, PATIENCE, PLAN, RETRIES, MechanismMpc
-from pendulum_lqr.swing_up.mechanism_planned import PlannedSwingUp
-from pendulum_lqr.swing_up.mechanism_search import PlanSettings
-from pendulum_lqr.swing_up.mechanism_trajectory import (
+from pendulum_lqr.swing_up import catch as catch_module
+from pendulum_lqr.swing_up import swing_up_cli
+from pendulum_lqr.swing_up.catch import CaughtRegion, MechanismCatch, deviation_of, make_mechanism_catch
+from pendulum_lqr.swing_up.ilqr import IlqrPlan, IlqrProblem, IlqrWeights
+from pendulum_lqr.swing_up.mpc import ITERATIONS, PATIENCE, PLAN, RETRIES, MechanismMpc
+from pendulum_lqr.swing_up.planned import PlannedSwingUp
+from pendulum_lqr.swing_up.search import PlanSettings
+from pendulum_lqr.swing_up.stored_swing_up import default_catch, stored_trajectory, tracked_swing_up
+from pendulum_lqr.swing_up.trajectory import (
     SwingUpSearch,
     cheapest_swing_up,
     load_trajectory,
     search_swing_up,
     write_trajectory,
 )
-from pendulum_lqr.swing_up.mechanism_tvlqr import MechanismTvlqr
-from pendulum_lqr.swing_up.stored_swing_up import default_catch, stored_trajectory, tracked_swing_up
+from pendulum_lqr.swing_up.tvlqr import MechanismTvlqr
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.runge_kutta import along_2, rk4_joints
 from pendulum_msgs_py.errors import ParameterError
@@ -51,18 +52,18 @@ def step(plant: PlantParameters, x: Vector, effort: Vector) -> Vector:
 def test_the_level_of_a_catch_is_that_of_trials_that_nobody_cut_short(name: str) -> None:
     plant = load_mechanism(name)
     catch = make_mechanism_catch(plant, (1.0, 1.0, 1.0, 1.0), 1.0)
-    samples = mechanism_catch._samples_of_level_1(catch.gain, 2)
+    samples = catch_module._samples_of_level_1(catch.gain, 2)
     # Nine tenths of what was found; the last bisection halved the way to four times as much four times.
     found = catch.region.level / 0.9
     for factor, caught in ((1.0, True), (1.001 * 4.0 ** (1.0 / 16.0), False)):
         deviations = math.sqrt(factor * found) * samples
-        assert mechanism_catch._all_caught(plant, catch.gain, deviations, 0.0) is caught, factor
+        assert catch_module._all_caught(plant, catch.gain, deviations, 0.0) is caught, factor
 
 
 def test_a_region_is_sampled_once_for_each_plant_and_gain(monkeypatch: pytest.MonkeyPatch) -> None:
     plant = load_mechanism("cart_pole")
     region = make_mechanism_catch(plant, Q, R).region
-    monkeypatch.setattr(mechanism_catch, "_all_caught", lambda *_: False)
+    monkeypatch.setattr(catch_module, "_all_caught", lambda *_: False)
     assert make_mechanism_catch(load_mechanism("cart_pole"), Q, R).region == region
     for other, r in ((plant, 1.01 * R), (plant.with_values({"cart_mass": 1.01}), R)):
         with pytest.raises(DesignError, match="catches no state"):
@@ -426,9 +427,7 @@ def test_nothing_is_planned_from_a_state_that_is_no_number() -> None:
 def test_a_search_whose_file_cannot_be_written_ends_before_it_begins(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(
-        "pendulum_lqr.swing_up.mechanism_trajectory.search_swing_up", lambda *_: pytest.fail("searched")
-    )
+    monkeypatch.setattr("pendulum_lqr.swing_up.trajectory.search_swing_up", lambda *_: pytest.fail("searched"))
     (tmp_path / "file").touch()
     assert swing_up_cli.main(["--guesses", "1", "--out", f"{tmp_path}/file/x.json"]) == 2
     assert "file/x.json cannot be written: " in capsys.readouterr().err

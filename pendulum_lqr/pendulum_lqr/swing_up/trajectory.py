@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_lqr.linear.design import DesignError
-from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
-from pendulum_lqr.swing_up.mechanism_ilqr import IlqrPlan, IlqrProblem, IlqrWeights
+from pendulum_lqr.swing_up.catch import MechanismCatch, deviation_of
+from pendulum_lqr.swing_up.ilqr import IlqrPlan, IlqrProblem, IlqrWeights
 from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints

@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pendulum_lqr.controller_interface.interface import Controller
 from pendulum_lqr.controller_interface.law import within_limits
-from pendulum_lqr.swing_up.mechanism_catch import MechanismCatch, deviation_of
-from pendulum_lqr.swing_up.mechanism_trajectory import MechanismTrajectory
+from pendulum_lqr.swing_up.catch import MechanismCatch, deviation_of
+from pendulum_lqr.swing_up.trajectory import MechanismTrajectory
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.errors import ParameterError
