@@ -107,6 +107,31 @@ def test_folders_options_and_tables_of_trials_give_one_ranking(
     assert "soft" in (tmp_path / "o" / "ranking.html").read_text(encoding="utf-8")
 
 
+def test_runs_without_seeds_are_judged_with_more_care(tmp_path: Path, capsys: Any) -> None:
+    generator = np.random.default_rng(0)
+    rows: list[dict[str, Any]] = [
+        {"controller": name, "side": side, "cost": cost * (1.0 + 0.01 * generator.standard_normal())}
+        for name, cost in (("a", 1.0), ("b", 1.2), ("c", 1.5))
+        for side in ("simulation", "hardware")
+        for _ in range(4)
+    ]
+    without = ranked(capsys, table(tmp_path / "without.csv", rows))
+    seeded = [row | {"seed": seed} for seed, row in enumerate(rows)]
+    with_seeds = ranked(capsys, table(tmp_path / "with.csv", seeded))
+    assert (without["unknown_seeds"], with_seeds["unknown_seeds"]) == (True, False)
+    assert "upper limit of the regret is taken at 0.25 %" in without["layer"]["sentence"]
+    assert "0.25 %" not in with_seeds["layer"]["sentence"]
+    # A worse pick, so that the limit is not at zero.
+    for row in seeded:
+        row["cost"] *= {("a", "hardware"): 1.22}.get((row["controller"], row["side"]), 1.0)
+    narrow = ranked(capsys, table(tmp_path / "with.csv", seeded))["regret_share"]["high"]
+    wide = ranked(capsys, table(tmp_path / "without.csv", [row | {"seed": ""} for row in seeded]))
+    assert wide["regret_share"]["high"] > narrow + 0.005
+    for seed in ("1.7", "-1"):
+        said = ranked(capsys, table(tmp_path / "x.csv", [rows[0] | {"seed": seed}]), code=2)
+        assert f"row 1 of {tmp_path / 'x.csv'}: seed is '{seed}'; expected a whole number, 0 or more" in said
+
+
 def test_a_table_of_scores_is_ranked_by_its_numbers(tmp_path: Path, capsys: Any) -> None:
     scores = {"ar": (0.97, 0.616), "hs": (0.90, 0.50), "mpc": (0.80, 0.755), "vi": (0.70, 0.40)}
     rows: list[dict[str, Any]] = [

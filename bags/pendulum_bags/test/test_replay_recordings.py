@@ -189,6 +189,31 @@ def test_the_recorded_controller_answers_as_it_did(tmp_path: Path) -> None:
     assert result.unanswered == 0
 
 
+@pytest.mark.parametrize("later", [0.0, 0.003])
+def test_a_controller_is_replayed_from_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str], later: float) -> None:
+    columns = regulate(rate=100.0, seed=3, duration=2.0)
+    bag = write_bag(tmp_path / "bag", columns, "/sim", metadata=run_metadata(3), ramps=False)
+    expected = replay_controller(bag, "lqr", values={"q": [1.0, 0.01]})
+    path = tmp_path / "run.csv"
+    lines = []
+    for t, theta, rate, torque in zip(
+        *(columns[name] for name in ("t", "position", "velocity", "command")), strict=True
+    ):
+        states = f"{t:.9f},{theta:.17g},{rate:.17g}"
+        lines += [f"{states},{torque:.17g}"] if not later else [f"{states},", f"{t + later:.9f},,,{torque:.17g}"]
+    path.write_text("\n".join(["time,theta,theta_dot,torque", *lines]) + "\n")
+    assert replay_main([str(path), "--controller", "lqr", "--set", "q=[1.0, 0.01]", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["commands"], found["unanswered_states"]) == (200, 0)
+    assert found["rms_difference_nm"] == pytest.approx(expected.as_dict()["rms_difference_nm"], rel=1e-6)
+    assert replay_main([str(path), "--controller", "lqr", "--start", "1", "--stop", "1.5", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["commands"] == 50
+    assert replay_main([str(path), "--controller", "recorded"]) == 2
+    assert "the recording does not say which controller made it" in capsys.readouterr().err
+    assert replay_main([str(path), "--controller", "lqr", "--start", "50"]) == 2
+    assert "has 0 samples from 50 s after its start, and ends at 1.99 s; expected at least 4" in capsys.readouterr().err
+
+
 def test_another_controller_answers_otherwise(tmp_path: Path) -> None:
     columns = regulate(rate=100.0, seed=3, duration=2.0)
     bag = write_bag(tmp_path / "bag", columns, "/sim", metadata=run_metadata(3), ramps=False)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pendulum_bags.runs.run_data import find_prefix
+from pendulum_bags.recordings.contract_bags import find_prefix
 from pendulum_course.tasks import HOLD_STEP, Tasks
 from pendulum_lqr.linear.analysis import closed_loop_poles, delayed_spectral_radius, loop_margins
 from pendulum_lqr.linear.design import continuous_lqr

@@ -73,7 +73,7 @@ def replay(
         from pendulum_bags.replay.controller_replay import parse_values, replay_controller
 
         result = replay_controller(
-            recording,
+            reading,
             None if controller == "recorded" else controller,
             plant=params or None,
             values=parse_values(set_value or []),
@@ -94,8 +94,6 @@ def replay(
             window=window,
             hold=hold,
             effort=effort,
-            start=start,
-            stop=stop,
             namespace=prefix or None,
         )
     content = result.as_dict()

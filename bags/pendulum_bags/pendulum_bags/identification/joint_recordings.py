@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -16,11 +15,8 @@ from pendulum_bags.recordings.guess import Guess
 from pendulum_bags.recordings.mapping import JointMotion
 from pendulum_bags.recordings.reading import Reading
 from pendulum_bags.runs.datasets import Recording, check_consistency, recording_of, unwrap
-from pendulum_bags.runs.run_data import find_prefix
 from pendulum_msgs_py.contract.joints import Coordinates
-from pendulum_msgs_py.contract.names import APPLIED_EFFORT, JOINT_STATES, PUSH
 from pendulum_msgs_py.errors import DataError
-from pendulum_rosbag.reader import read_bag
 
 __all__ = ["JointRecording", "matched_joints", "read_joints"]
 
@@ -129,71 +125,90 @@ def read_joints(
     reading = Reading.of(path)
     if mapping is not None:
         reading = replace(reading, mapping=mapping, _cache={})
-    if reading.has_states:
-        return _chosen_part(_read_bag(reading.path, coordinates), reading)
-    motion = reading.motion
+    motion, is_bag = reading.motion, reading.has_states
+    if pushed := motion.meta.get("pushed"):
+        raise DataError(f"topic {pushed} of {motion.meta['mapping']} pushes links from outside; expected none of that")
+    ordered, renamed = _ordered(reading, coordinates)
     parts: list[Recording] = []
-    for index, (joint, moved) in enumerate(zip(coordinates.joints, _ordered(reading, coordinates), strict=True)):
+    for index, (joint, moved) in enumerate(zip(coordinates.joints, ordered, strict=True)):
         drive = moved.drive
         if drive is None and index in coordinates.driven:
             raise DataError(
                 f"{motion.meta['mapping']}: joints.{joint.name} has no effort, but the plant has an actuator there; "
-                "expected the column of its torque or force"
+                "expected its torque or force"
             )
-        if moved.slides != (joint.unit == "m"):
+        if not is_bag and moved.slides != (joint.unit == "m"):
             raise DataError(
                 f"{reading.path}: {moved.name} is in {'m' if moved.slides else 'rad'}; expected {joint.unit} for "
                 f"{joint.name}: correct its unit in a mapping file"
             )
-        if drive is not None and drive.quantity != ("effort" if joint.unit == "rad" else "force"):
+        if not is_bag and drive is not None and drive.quantity != ("effort" if joint.unit == "rad" else "force"):
             raise DataError(
                 f"{motion.meta['mapping']}: the input of {joint.name} is a {drive.quantity}; expected an effort in "
                 f"{joint.effort_unit}"
             )
-        part = recording_of(motion, moved)
+        if is_bag:  # whose messages state no units, and where sensors measure an effort at passive joints
+            measured = drive is not None and not drive.own_clock and index not in coordinates.driven
+            part = recording_of(motion, replace(moved, velocity=None, drive=None if measured else drive))
+        else:
+            part = recording_of(motion, moved)
         parts.append(check_consistency(unwrap(part)) if joint.turns else check_consistency(part))
+    time, position = parts[0].time, np.stack([part.position for part in parts], axis=1)
+    velocities = [moved.velocity for moved in ordered if is_bag and moved.velocity is not None]
+    velocity = np.stack(velocities, axis=1) if len(velocities) == len(parts) else None
     recording = JointRecording(
         reading.name,
-        parts[0].time,
-        np.stack([part.position for part in parts], axis=1),
-        np.stack([_at(part, parts[0].time) for part in parts], axis=1),
+        time,
+        position,
+        np.stack([_at(part, time) for part in parts], axis=1),
         tuple(part.hold for part in parts),
         str(reading.path),
-        sum(int(motion.meta.get(key, 0)) for key in ("repeated_stamps", "nan_rows")),
+        sum(int(motion.meta.get(key, 0)) for key in ("repeated_stamps", "repeated_states", "nan_rows")),
         _passive(coordinates, [bool(np.any(part.input)) for part in parts]),
+        None if velocity is None else _tracks_position(time, position, velocity),
+        motion.meta,
+        renamed,
     )
     return _chosen_part(recording, reading)
 
 
 def _chosen_part(recording: JointRecording, reading: Reading) -> JointRecording:
-    """Return the part of a recording that its reading asks for, from its beginning [s]."""
-    if reading.start is None and reading.stop is None:
-        return recording
-    time, stop = recording.time - recording.time[0], math.inf if reading.stop is None else reading.stop
-    rows = (time >= (reading.start or 0.0)) & (time <= stop)
+    """Return the part of a recording that its reading asks for."""
+    rows = reading.rows(recording.time)
     cut = {name: getattr(recording, name)[rows] for name in ("time", "position", "effort")}
-    velocity = None if recording.velocity is None else recording.velocity[rows]
-    return replace(recording, **cut, velocity=velocity)
+    return replace(recording, **cut, velocity=None if recording.velocity is None else recording.velocity[rows])
 
 
-def _ordered(reading: Reading, coordinates: Coordinates) -> list[JointMotion]:
-    """Return the joints of a recording in the order of the plant's.
+def _ordered(reading: Reading, coordinates: Coordinates) -> tuple[list[JointMotion], str]:
+    """Return the joints of a recording in the order of the plant's, and which of a bag are taken for them.
 
     They go by their names, or by which are driven; guessed columns by their places where neither decides.
     """
     found = {joint.name: joint for joint in reading.motion.joints}
-    names = coordinates.names
+    names, is_bag = coordinates.names, reading.has_states
     if sorted(found) == sorted(names):
-        return [found[name] for name in names]
-    if len(found) != len(names) or not reading.rules.guessed:
-        known = ", ".join(name or "one without a name" for name in found)
-        raise DataError(f"{reading.rules.origin} of {reading.name}: joints are {known}; expected {', '.join(names)}")
-    driven = [one for one, joint in found.items() if joint.drive is not None and np.any(joint.drive.values)]
+        return [found[name] for name in names], ""
+    known, origin = ", ".join(name or "one without a name" for name in found), reading.motion.meta["mapping"]
+    if len(found) != len(names) or not (is_bag or reading.rules.guessed):
+        raise DataError(f"{origin} of {reading.name}: joints are {known}; expected {', '.join(names)}")
+    driven = [
+        name
+        for name, joint in found.items()
+        if joint.drive is not None and (np.any(joint.drive.values) or (is_bag and joint.drive.own_clock))
+    ]
     sure = matched_joints(list(found), driven, coordinates)
     order, how = sure or (list(found), "by its place in the file")
-    for name, one in zip(names, order, strict=True):
-        reading.add_guess(Guess(name, one, "", f"{how}, of the plant's joints", sure is None))
-    return [found[one] for one in order]
+    if not is_bag:
+        for name, one in zip(names, order, strict=True):
+            reading.add_guess(Guess(name, one, "", f"{how}, of the plant's joints", sure is None))
+        return [found[one] for one in order], ""
+    if sure is None:
+        raise DataError(
+            f"{origin} is of the joints {known}; expected {', '.join(names)}, and neither names nor efforts show which "
+            "is which: `--mapping FILE` names their columns"
+        )
+    renamed = f"joints {', '.join(order)} are taken for {', '.join(names)}, {how.replace('its', 'their')}"
+    return [found[one] for one in order], renamed
 
 
 def matched_joints(
@@ -226,61 +241,6 @@ def _at(part: Recording, time: Array) -> Array:
 
 def _passive(coordinates: Coordinates, driven: Sequence[bool]) -> tuple[str, ...]:
     return tuple(name for i, name in enumerate(coordinates.names) if i not in coordinates.driven and driven[i])
-
-
-def _read_bag(source: Path, coordinates: Coordinates) -> JointRecording:
-    with read_bag(source) as bag:
-        space = find_prefix(bag)
-        states = bag.joints(f"{space}/{JOINT_STATES}")
-        applied_topic, push_topic = f"{space}/{APPLIED_EFFORT}", f"{space}/{PUSH}"
-        applied = bag.joints(applied_topic) if applied_topic in bag.topics else None
-        if push_topic in bag.topics and np.any(bag.joints(push_topic).effort):
-            raise DataError(f"topic {push_topic} of bag {source} pushes links from outside; expected none of that")
-        meta = dict(bag.metadata)
-    order, how = list(coordinates.names), ""
-    if sorted(states.names) != sorted(order):
-        pairs = zip(states.names, states.effort.T, strict=True)
-        driven = [name for name, effort in pairs if np.any(effort)] if applied is None else list(applied.names)
-        same = len(states.names) == len(order)
-        if not same or (matched := matched_joints(states.names, driven, coordinates)) is None:
-            way = ", and neither names nor efforts show which is which: `--mapping FILE` names their columns"
-            raise DataError(
-                f"bag {source} is of the joints {', '.join(states.names)}; expected {', '.join(order)}{way * same}"
-            )
-        order, how = matched
-    columns = [states.names.index(name) for name in order]
-    # A plant in lockstep sends a state again when its answer was missed: the same stamp is the same state.
-    stamps, first = np.unique(states.stamp_ns, return_index=True)
-    position, effort = states.position[first][:, columns], np.zeros((stamps.size, len(columns)))
-    if applied is None:
-        rows_of = list(coordinates.driven)
-        effort[:, rows_of] = states.effort[first][:, columns][:, rows_of]
-    else:
-        motors = {order[index] for index in coordinates.driven}
-        if not motors <= set(applied.names) <= set(order):
-            raise DataError(
-                f"topic {applied_topic} of bag {source} is of {', '.join(applied.names)}; expected the driven joints, "
-                f"{', '.join(sorted(motors, key=order.index))}"
-            )
-        rows_of = [order.index(name) for name in applied.names]
-        told, rows = np.unique(applied.stamp_ns, return_index=True)
-        newest = np.searchsorted(told, stamps, side="right") - 1
-        # Before the first of them nothing was applied yet.
-        effort[:, rows_of] = np.where((newest >= 0)[:, None], applied.effort[rows][np.maximum(newest, 0)], 0.0)
-    return JointRecording(
-        source.resolve().name,
-        (stamps - stamps[0]) * 1e-9,
-        position,
-        effort,
-        ("linear" if applied is None else "zero",) * len(states.names),
-        str(source),
-        int(states.stamp_ns.size - stamps.size),
-        _passive(coordinates, np.any(effort, axis=0).tolist()),
-        _tracks_position((stamps - stamps[0]) * 1e-9, position, states.velocity[first][:, columns]),
-        meta,
-        how
-        and f"joints {', '.join(order)} are taken for {', '.join(coordinates.names)}, {how.replace('its', 'their')}",
-    )
 
 
 def _tracks_position(time: Array, position: Array, velocity: Array) -> Array | None:

@@ -29,7 +29,7 @@ class Contender:
         sim, hw: Parts of the cost, one row for each run (by seed), shape (runs, 3); no rows for a side that failed. Of
             costs from a table shape (runs, 1), of scores their negatives.
         sim_failed, hw_failed: How many runs failed on each side.
-        sim_seeds, hw_seeds: Seeds of the rows; none where they are not known.
+        sim_seeds, hw_seeds: Seeds of the rows, negative where a file or a table does not state them; may be left out.
         emulated: Whether the hardware was emulated, in all runs.
     """
 
@@ -90,11 +90,13 @@ def _side(runs: Sequence[tuple[int, Array | None]]) -> tuple[Array, int, tuple[i
 
 
 def with_noise_of_their_own(contenders: Sequence[Contender]) -> tuple[Sequence[Contender], bool]:
-    """Return the contenders without simulated runs whose noise the hardware had too, and whether such are left.
+    """Return the contenders without simulated runs whose noise the hardware had too, and whether such may be left.
 
-    They are left where a contender has no others: a simulation that picks under the noise that judges its pick picks
-    what this noise favours.
+    They are left where a contender has no others, or where seeds are not stated: a simulation that picks under the
+    noise that judges its pick picks what this noise favours.
     """
+    if any(seed < 0 for one in contenders for seed in (*one.sim_seeds, *one.hw_seeds)):
+        return contenders, True
     shared = any(one.shared_seeds for one in contenders)
     if not shared or any(one.sim_seeds and one.shared_seeds == set(one.sim_seeds) for one in contenders):
         return contenders, shared

@@ -90,6 +90,7 @@ class Ranking:
         spearman_ends: 95 % interval of the rank correlation over the runs; NaN where none was repeated.
         means: Of each contender on the hardware, with its 95 % interval over the runs.
         of_scores: Whether costs are scores, of which more is better.
+        unknown_seeds: Whether runs do not state which seed their disturbance had.
     """
 
     names: Sequence[str]
@@ -111,6 +112,7 @@ class Ranking:
     spearman_ends: tuple[float, float] = (math.nan, math.nan)
     means: Sequence[Interval] = ()
     of_scores: bool = False
+    unknown_seeds: bool = False
 
     @property
     def few(self) -> str:
@@ -200,6 +202,7 @@ def rank(
         _ends_of_ranks(contenders, generator),
         [Interval(*one) for one in means],
         of_scores,
+        any(seed < 0 for one in contenders for seed in (*one.sim_seeds, *one.hw_seeds)),
     )
 
 

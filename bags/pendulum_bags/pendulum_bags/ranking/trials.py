@@ -146,7 +146,10 @@ def trials_of(rows: Sequence[Mapping[str, Any]], origin: str, folder: Path, temp
         name, value = str(given["controller"]).strip(), given[key]
         if name in {"", "None"}:
             raise DataError(f"{of} names no controller; expected its name")
-        seed = None if given.get("seed") in (None, "") else int(_number(given["seed"], f"{of}: seed"))
+        number_of = None if given.get("seed") in (None, "") else _number(given["seed"], f"{of}: seed")
+        if number_of is not None and not (number_of >= 0.0 and number_of.is_integer()):
+            raise DataError(f"{of}: seed is {given['seed']!r}; expected a whole number, 0 or more")
+        seed = None if number_of is None else int(number_of)
         trial = Trial(name, _SIDES[side.casefold()], seed=seed, is_score=key == "score")
         if key == "file":
             trial = replace(trial, reading=replace(template, path=folder / str(value).strip(), _cache={}))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import subprocess
 import tempfile
@@ -13,10 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.recordings.array_files import read_matlab, read_numpy
 from pendulum_bags.recordings.bag_columns import read_bag_columns
 from pendulum_bags.recordings.bridge_programs import last_words, run_bridge_program
 from pendulum_bags.recordings.columns import Column, Columns, part_of
+from pendulum_bags.recordings.contract_bags import read_contract_bag
 from pendulum_bags.recordings.delimited import read_delimited
 from pendulum_bags.recordings.guess import Guess, guess_rules, is_of
 from pendulum_bags.recordings.mapping import MAPPINGS, Motion, Rules, apply_rules, load_rules
@@ -63,6 +66,7 @@ class Reading:
         dt: Time between two rows of a file without a time column [s].
         start, stop: Part to take, from the beginning of the recording [s].
         alone: Whether ``topics`` are of no other recording: each is to be in this one.
+        effort, namespace: As :func:`~pendulum_bags.recordings.contract_bags.read_contract_bag` takes them.
     """
 
     path: Path
@@ -72,6 +76,8 @@ class Reading:
     start: float | None = None
     stop: float | None = None
     alone: bool = False
+    effort: str = "applied"
+    namespace: str | None = None
     _cache: dict[str, Any] = field(default_factory=dict, compare=False, repr=False)
 
     def __fspath__(self) -> str:
@@ -183,9 +189,34 @@ class Reading:
     def motion(self) -> Motion:
         """The recording in SI units."""
         if "motion" not in self._cache:
-            self._cache["motion"] = apply_rules(self.columns, self.rules)
-            self.columns.forget()
+            if self.has_states:
+                free = self.mapping == "free_swing"
+                source, _ = part_of(self.path)
+                self._cache["motion"] = read_contract_bag(
+                    source, effort=self.effort, namespace=self.namespace, swings_freely=free
+                )
+            else:
+                self._cache["motion"] = apply_rules(self.columns, self.rules)
+                self.columns.forget()
         return self._cache["motion"]
+
+    def rows(self, time: Array) -> slice:
+        """Return the rows of some stamps [s] that lie in the part of the recording that was chosen.
+
+        Raises:
+            DataError: There are fewer than four.
+        """
+        if self.start is None and self.stop is None:
+            return slice(0, time.size)
+        begin, stop = self.start or 0.0, math.inf if self.stop is None else self.stop
+        first, last = (int(row) for row in np.searchsorted(time - time[0], (begin, stop)))
+        if last - first < 4:
+            until = "" if self.stop is None else f" to {stop:g} s"
+            raise DataError(
+                f"{self.path} has {last - first} samples from {begin:g} s{until} after its start, and ends at "
+                f"{time[-1] - time[0]:.2f} s; expected at least 4"
+            )
+        return slice(first, last)
 
     def forget(self) -> None:
         """Free the columns and the motion; mapping and guesses stay."""

@@ -8,19 +8,17 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.comparison.statistics import rms
-from pendulum_bags.runs.run_data import find_prefix
+from pendulum_bags.recordings.reading import Reading
+from pendulum_bags.runs.read_recording import read_recording
+from pendulum_bags.runs.run_data import slope
 from pendulum_bags.runs.run_record import run_record
 from pendulum_lqr.controller_interface.controller import controller_parameters, make_controller
-from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.angles import from_upright
-from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
-from pendulum_rosbag.reader import read_bag
 
 if TYPE_CHECKING:
     from pendulum_bags.figures.figure import Figure
@@ -112,7 +110,7 @@ def recorded_controller(metadata: Mapping[str, Any]) -> tuple[str, dict[str, Any
     run = run_record(metadata)
     recorded = run.get("controller")
     if not isinstance(recorded, Mapping) or "kind" not in recorded:
-        raise DataError("the bag does not say which controller made it; expected pendulum.run.controller, or name one")
+        raise DataError("the recording does not say which controller made it: name one, with its gains")
     name = str(recorded["kind"])
     known = {spec.name for spec in controller_parameters(name)}
     values = {key: value for key, value in recorded.items() if key in known}
@@ -128,10 +126,10 @@ def replay_controller(
     values: Mapping[str, object] | None = None,
     prefix: str | None = None,
 ) -> ControllerReplay:
-    """Feed the states of a bag to a controller, in order, and pair its commands with the recorded ones by their stamp.
+    """Feed recorded states to a controller, in order, and pair its commands with the recorded ones by their stamp.
 
     Args:
-        path: Bag with ``joint_states`` and ``effort_command``.
+        path: Recording of any format, with states and the torque that answered them; of a bag ``effort_command``.
         controller: Name of the controller; None for the one that made the recording.
         plant: Plant to design on; None for that of the recording, or the thesis's where it was real hardware.
         values: Parameters of the controller.
@@ -141,54 +139,45 @@ def replay_controller(
         DataError: The bag lacks states or commands, or no command has the stamp of a state.
         ParameterError: No such controller or plant, or a value out of domain.
     """
-    with read_bag(path) as bag:
-        space = find_prefix(bag, prefix)
-        states = bag.array(f"{space}/{names.JOINT_STATES}")
-        commands = bag.array(f"{space}/{names.EFFORT_COMMAND}")
-        metadata = dict(bag.metadata)
+    reading = Reading.of(path)
+    recording = read_recording(reading, effort="commanded", namespace=prefix)
+    if recording.input_kind != "effort":
+        raise DataError(f"{reading.path} has no commands in N m; expected the torque that answered each state")
     if controller is None:
-        controller, recorded_values, design_plant = recorded_controller(metadata)
+        controller, recorded_values, design_plant = recorded_controller(recording.meta)
         values = {**recorded_values, **(values or {})}
     else:
         design_plant = "thesis"
     if plant is None:
         plant = "thesis" if design_plant in {"emulator", "hebi"} else design_plant
     parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)
-    states = _by_stamp(states, f"{space}/{names.JOINT_STATES} of bag {path}")
-    commands = _by_stamp(commands, f"{space}/{names.EFFORT_COMMAND} of bag {path}")
-    first, last = (int(i) for i in np.searchsorted(states["stamp_ns"], commands["stamp_ns"][[0, -1]]))
-    states = states[first : last + 1]
-    if len(states) < 2:
-        raise DataError(f"bag {path} has no command that answers a state; expected equal stamps")
-    period = float(np.median(np.diff(states["stamp_ns"]))) / NANOSECONDS
-    law = make_controller(controller, parameters, period, values)
+    time, stamps = recording.time, recording.input_stamps
+    # A command has the stamp of its state; in files with a clock for each it answers the newest state.
+    answered = np.searchsorted(time, stamps, side="right") - 1
+    same = (answered >= 0) & (time[np.maximum(answered, 0)] == stamps)
+    rows = np.flatnonzero(same if same.any() or reading.has_states else answered >= 0)
+    mine, first = np.unique(answered[rows], return_index=True)
+    if mine.size < 2:
+        raise DataError(f"{reading.path} has no command that answers a state; expected equal stamps")
+    law = make_controller(controller, parameters, recording.period, values)
     law.reset()
-    t = (states["stamp_ns"] - states["stamp_ns"][0]) / NANOSECONDS
-    angles = from_upright(np.ascontiguousarray(states["position"], dtype=float))
-    answers = np.array(
-        [
-            law.command(time, (angle, velocity))
-            for time, angle, velocity in zip(t.tolist(), angles.tolist(), states["velocity"].tolist(), strict=True)
-        ]
+    part = slice(int(mine[0]), int(mine[-1]) + 1)
+    velocity = slope(time, recording.position) if recording.velocity is None else recording.velocity
+    states = zip(
+        (time[part] - time[part][0]).tolist(),
+        from_upright(recording.position[part]).tolist(),
+        velocity[part].tolist(),
+        strict=True,
     )
-    _, mine, theirs = np.intersect1d(states["stamp_ns"], commands["stamp_ns"], return_indices=True)
-    if mine.size == 0:
-        raise DataError(f"bag {path} has no command that answers a state; expected equal stamps")
+    answers = np.array([law.command(t, (angle, rate)) for t, angle, rate in states])
     return ControllerReplay(
         controller,
         law.describe(),
-        t[mine],
-        commands["effort"][theirs],
-        answers[mine],
-        len(states) - int(mine.size),
+        time[mine] - time[part][0],
+        recording.input[rows[first]],
+        answers[mine - part.start],
+        int(answers.size - mine.size),
     )
-
-
-def _by_stamp(array: NDArray[Any], topic: str) -> NDArray[Any]:
-    if not len(array):
-        raise DataError(f"topic {topic} has no message; expected states, and commands that answer them")
-    _, first = np.unique(array["stamp_ns"], return_index=True)
-    return array[first]
 
 
 def parse_values(texts: Sequence[str]) -> dict[str, object]:

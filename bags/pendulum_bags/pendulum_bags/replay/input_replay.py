@@ -36,8 +36,6 @@ def replay_recording(
     mapping: str | Path | None = None,
     hold: str | None = None,
     effort: str = "applied",
-    start: float | None = None,
-    stop: float | None = None,
     namespace: str | None = None,
 ) -> InputReplay:
     """Read a recording (CSV or bag) and drive a plant with its torque.
@@ -49,8 +47,6 @@ def replay_recording(
         mapping: Mapping file of a CSV.
         hold: Of the input of a CSV, ``zero`` or ``linear``; by default that of its mapping.
         effort: For bags, ``applied`` or ``measured`` torque.
-        start: Leave out what comes before, from the beginning of the recording [s].
-        stop: Leave out what comes after [s].
         namespace: For bags with several plants, such as ``/sim``.
 
     A voltage, a set point or a free swing drives the fit that identification wrote next to the plant file.
@@ -60,10 +56,6 @@ def replay_recording(
         ParameterError: The plant file is refused.
     """
     recording = read_recording(path, mapping, effort=effort, namespace=namespace, hold=hold)
-    if start is not None or stop is not None:
-        begin = float(recording.time[0])
-        last = math.inf if stop is None else begin + stop
-        recording = recording.between(begin + (start or 0.0), last)
     if recording.input_kind != "effort" or (isinstance(plant, str | Path) and Path(plant).suffix == ".json"):
         return replay_fit(recording, plant, window=window)
     parameters = plant if isinstance(plant, PlantParameters) else load_plant(plant)

@@ -12,7 +12,6 @@ import numpy as np
 
 from pendulum_bags.recordings.clock import first_of_each_stamp
 from pendulum_bags.recordings.reading import Reading
-from pendulum_bags.runs.bag_recordings import read_bag_recording
 from pendulum_bags.runs.datasets import Recording, check_consistency, recording_of, unwrap
 from pendulum_msgs_py.errors import DataError
 
@@ -27,14 +26,14 @@ def read_recording(
     namespace: str | None = None,
     hold: str | None = None,
 ) -> Recording:
-    """Read a recording of one pendulum, of any format.
+    """Read a recording of one pendulum, of any format, or the part of it that a reading chooses.
 
     Args:
         path: File or folder, or a :class:`~pendulum_bags.recordings.reading.Reading`.
         mapping: Mapping file, name of a built-in mapping or the mapping itself; by default the columns are guessed. For
             a HEBI log the lab file with zero, sign and tare; ``free_swing`` takes no effort from a bag.
-        effort: For bags: ``applied`` (topic ``applied_effort``) or ``measured`` (joint torque in ``joint_states``).
-        namespace: For bags with several plants, such as ``/sim``.
+        effort: Of a bag, as :func:`~pendulum_bags.recordings.contract_bags.read_contract_bag` takes it.
+        namespace: Of a bag with several plants, such as ``/sim``.
         hold: ``zero`` (a command, held) or ``linear`` (a measurement), in place of the mapping's.
 
     Raises:
@@ -45,9 +44,7 @@ def read_recording(
     if mapping is not None:
         reading = replace(reading, mapping=mapping, _cache={})
     if reading.has_states:
-        free = mapping == "free_swing"
-        found = read_bag_recording(reading.path, effort=effort, namespace=namespace, swings_freely=free)
-        return check_consistency(unwrap(found))
+        reading = replace(reading, effort=effort, namespace=namespace, _cache={})
     motion = reading.motion
     if len(motion.joints) != 1:
         raise DataError(
@@ -55,11 +52,15 @@ def read_recording(
             "--plant names the mechanism of several, a mapping file chooses the columns of one"
         )
     recording = recording_of(motion, motion.joints[0], hold)
-    return check_consistency(unwrap(_with_switch(recording, reading)))
+    recording = check_consistency(unwrap(_with_switch(recording, reading)))
+    rows = reading.rows(recording.time)
+    return recording if rows == slice(0, recording.time.size) else recording.rows(rows.start, rows.stop)
 
 
 def _with_switch(recording: Recording, reading: Reading) -> Recording:
     """Return a servo's log with its torque switch, and its own report of its duty cycle, -1 to 1, as ``load``."""
+    if reading.has_states:
+        return recording
     columns = reading.columns
     if not {"goal_position", "torque_enable"} <= columns.columns.keys() or recording.input_kind != "position_goal":
         return recording

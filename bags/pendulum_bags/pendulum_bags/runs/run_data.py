@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
@@ -14,6 +13,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from pendulum_bags.recordings.contract_bags import find_prefix
 from pendulum_bags.recordings.mapping import Drive
 from pendulum_bags.recordings.reading import Reading, holds_states
 from pendulum_bags.runs.correlation import effective_size
@@ -35,7 +35,6 @@ __all__ = [
     "TOLERATED",
     "OpenBag",
     "RunData",
-    "find_prefix",
     "is_emulated",
     "is_in_lockstep",
     "joints_of",
@@ -44,6 +43,7 @@ __all__ = [
     "plant_summary",
     "read_run",
     "shared_joints",
+    "slope",
     "surrogate_of",
     "timing_warning",
 ]
@@ -134,26 +134,6 @@ class RunData:
     def event_time(self, name: str) -> float | None:
         """Return when an event of a name first happened [s], None where it did not."""
         return next((float(event["t"]) for event in self.events if event["name"] == name), None)
-
-
-def find_prefix(bag: Bag, prefix: str | None = None) -> str:
-    """Return a namespace such as ``/sim``, by default that of the one plant of a bag; empty for ``/joint_states``.
-
-    Raises:
-        DataError: The bag has no plant, or several and no namespace is given.
-    """
-    if prefix is not None:
-        return f"/{prefix.strip('/')}".rstrip("/")
-    ending = f"/{names.JOINT_STATES}"
-    found = sorted(topic[: -len(ending)] for topic in bag.topics if topic.endswith(ending))
-    if len(found) == 1:
-        return found[0]
-    if not found:
-        raise DataError(f"bag {bag.path} has no topic that ends in {ending}; it has {', '.join(bag.topics) or 'none'}")
-    raise DataError(
-        f"bag {bag.path} holds several plants ({', '.join(found)}); choose one by its namespace, or keep one with "
-        f"`pendulum filter {bag.path} --regex '^{found[0]}/' -o FOLDER`"
-    )
 
 
 def joints_of(
@@ -318,8 +298,8 @@ def read_run(
     if reading.start is None and reading.stop is None:
         return run
     # The part that was chosen counts from the beginning of the recording, as of a file.
-    begin, last = float(times[0]), math.inf if reading.stop is None else reading.stop
-    return run.between(begin + (reading.start or 0.0), begin + last)
+    part = times[reading.rows(times)]
+    return run.between(max(part[0], window.t[0]), min(part[-1], window.t[-1]) + 0.5 * whole.period)
 
 
 def _run_of(reading: Reading, name: str, joint: str | None) -> RunData:
@@ -335,7 +315,7 @@ def _run_of(reading: Reading, name: str, joint: str | None) -> RunData:
     recording = check_consistency(recording if found.slides else unwrap(recording))
     times = recording.time - recording.time[0]
     position = recording.position if found.slides else unwrap_near_upright(recording.position)
-    velocity = _slope(times, position) if recording.velocity is None else recording.velocity
+    velocity = slope(times, position) if recording.velocity is None else recording.velocity
     drive, begin = found.drive, float(recording.time[0])
 
     def signal(drive: Drive | None, what: str) -> Signal | None:
@@ -352,8 +332,8 @@ def _run_of(reading: Reading, name: str, joint: str | None) -> RunData:
         "m" if found.slides else "rad",
         "" if drive is None else units.get(drive.quantity, ""),
     )
-    last = math.inf if reading.stop is None else reading.stop
-    window = whole if reading.start is None and reading.stop is None else whole.between(reading.start or 0.0, last)
+    part = reading.rows(times)
+    window = whole if part == slice(0, times.size) else whole.at(part)
     followed, disturbance = signal(found.reference, "reference of"), signal(found.disturbance, "disturbance on")
     stamps = np.round(window.t * NANOSECONDS).astype(np.int64)
     return RunData(
@@ -376,7 +356,7 @@ def _run_of(reading: Reading, name: str, joint: str | None) -> RunData:
     )
 
 
-def _slope(times: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
+def slope(times: NDArray[np.float64], position: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the velocity of a position that is quantised: slopes of parabolas through 20 ms, or five samples."""
     period = float(np.median(np.diff(times)))
     width = 2 * max(2, round(0.5 * _SMOOTHED / period)) + 1

@@ -132,13 +132,12 @@ class Series:
             raise DataError(
                 f"{self.name} has {last - first} samples between {start:.3f} s and {stop:.3f} s; expected at least 4"
             )
-        cut = slice(first, last)
+        return self.at(slice(first, last))
+
+    def at(self, rows: slice) -> Series:
+        """Return some of the samples."""
         return replace(
-            self,
-            t=self.t[cut],
-            position=self.position[cut],
-            velocity=self.velocity[cut],
-            effort=self.effort[cut],
+            self, t=self.t[rows], position=self.position[rows], velocity=self.velocity[rows], effort=self.effort[rows]
         )
 
     def shifted(self, delay: float) -> Series:
