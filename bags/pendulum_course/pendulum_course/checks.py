@@ -70,11 +70,7 @@ class Judgement:
 
 
 def check_gains(tasks: Tasks, q: Sequence[float], r: float) -> Judgement:
-    """Judge LQR weights, Q's diagonal [1/rad^2, s^2/rad^2] and R [1/(N m)^2], by their loop's time constant.
-
-    Raises:
-        DesignError: The weights make no design.
-    """
+    """Judge LQR weights, Q's diagonal [1/rad^2, s^2/rad^2] and R [1/(N m)^2], by their loop's time constant."""
     found = time_constant(q, r)
     asked = tasks.time_constant
     near = abs(found / asked - 1.0) <= _TIME_TOLERANCE
@@ -175,7 +171,7 @@ def _percent(share: float) -> str:
 
 
 def _what_is_missing(since: Any, untold: Any, until: float) -> str:
-    """Return which torques a recording lacks around a fault, empty for none: missing ones may have acted.
+    """Return which torques a recording lacks around a fault, or "": missing ones may have acted.
 
     Times of torques (``since``), of states without one (``untold``) and of the next arming (``until``) are [s] after
     it.
@@ -196,10 +192,7 @@ def _what_is_missing(since: Any, untold: Any, until: float) -> str:
 
 
 def time_constant(q: Sequence[float], r: float) -> float:
-    """Return the time constant of an LQR's loop around the thesis's plant [s].
-
-    ``q`` is Q's diagonal [1/rad^2, s^2/rad^2], ``r`` R [1/(N m)^2]. Raises a DesignError if they make no design.
-    """
+    """Return the time constant of an LQR's loop around the thesis's plant [s]; weights as in :func:`check_gains`."""
     model = _thesis_model()
     return float(-1.0 / closed_loop_poles(model, continuous_lqr(model, list(q), r).K).real.max())
 

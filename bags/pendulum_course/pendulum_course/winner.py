@@ -23,8 +23,7 @@ DURATION = 5.0
 def check_winner(tasks: Tasks, name: str, folder: Path, on_run: Callable[[str], None] = lambda name: None) -> Judgement:
     """Run both controllers on the emulated machine, and judge the predicted winner ``name``, a or b.
 
-    ``on_run`` is called with a controller's name before it runs. Raises a ParameterError for another name, a FaultError
-    if a program ended or did not respond.
+    ``on_run`` is called with a controller's name before it runs. A FaultError if a program failed.
     """
     weights = {"a": tasks.controller_a, "b": tasks.controller_b}
     if name not in weights:
@@ -45,8 +44,7 @@ def check_winner(tasks: Tasks, name: str, folder: Path, on_run: Callable[[str], 
 def spread_on_machine(bag: Path, r: float, seed: int, hosts: HostPool | None = None) -> float:
     """Return the standard deviation of theta of an LQR on the emulated machine under noise of 2.5 N m [rad].
 
-    ``r`` is R [1/(N m)^2], ``seed`` of the noise, ``hosts`` as for
-    :func:`pendulum_bags.experiments.lockstep.record_run`. Returns inf if the bridge faults, which counts as a loss.
+    ``r`` is R [1/(N m)^2], ``seed`` of the noise. Returns inf if the bridge faults, which counts as a loss.
     """
     spec = RunSpec(
         side="hw",

@@ -59,8 +59,8 @@ class TrainingPlant:
         limits: Largest effort of each driven joint, shape (m,) [N m or N].
         kicks: Largest kick of each joint at share 1, shape (n,): its effort limit, or without a motor the largest
             torque of gravity [N m or N].
-        row: Its parameters as the kernel takes them, shape (p,).
-        columns: Column of each parameter there, by name.
+        row: Its parameters in the order of the kernel, shape (p,).
+        columns: Column of each parameter in ``row``, by name.
         ratios: Columns of static and Coulomb friction, and their fixed ratio, of each joint that has any.
         offsets: Columns of the constant effort at each driven joint.
         longest: Longest step of the integrator [s].
@@ -145,8 +145,8 @@ def kicks_of(plant: PlantParameters) -> Array:
 def velocity_scales(plant: PlantParameters, travel: float) -> tuple[float, ...]:
     """Return the velocity of each joint that is scaled to 1 [rad/s or m/s].
 
-    If gravity acts on the joint, half of its frictionless speed after a fall from upright, at least 1; if it slides,
-    half of the speed that its motor reaches at the end of its travel ``travel`` [m].
+    Under gravity, half of its frictionless speed after a fall from upright, at least 1; for a sliding joint, half of
+    the speed that its motor reaches over ``travel`` [m].
     """
     if plant.is_pendulum:
         return (max(1.0, math.sqrt(plant.gravity / plant.inertia)),)
@@ -163,7 +163,6 @@ def velocity_scales(plant: PlantParameters, travel: float) -> tuple[float, ...]:
 
 
 def _gravity(plant: PlantParameters) -> tuple[float, ...]:
-    """Return the largest torque of gravity on each joint with the others hanging [N m or N]."""
     n, step = len(plant.joints), 1e-6
     found = []
     for i in range(n):
@@ -355,7 +354,6 @@ def _mechanism_kernel(name: str, goal: tuple[float, ...]) -> Any:
 
 
 def _kernel(goal: tuple[float, ...], prepare: Any, forward: Any) -> Any:
-    """Return the compiled loop over plants, in which the effort for a state acts after its delay."""
     n = len(goal)
     load = tuple_loader(n, 1)
 

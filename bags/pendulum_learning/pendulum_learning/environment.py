@@ -1,7 +1,4 @@
-"""Plants on which a policy learns, each with its own parameters, delay and noise.
-
-The effort for a state acts after the delay; until then the previous effort acts. One joint is n = 1.
-"""
+"""Plants on which a policy learns, each with its own parameters, delay and noise. One joint is n = 1."""
 
 from __future__ import annotations
 
@@ -46,9 +43,6 @@ _MOST_DRAWS = 50
 
 class SwingUp:
     """N plants of n joints, m of them driven, under one policy.
-
-    Args:
-        plant: The nominal plant; rigid, or of several joints.
 
     Raises:
         ParameterError: The plant is series elastic, has no motor, or a delay of its own.
@@ -127,8 +121,7 @@ class SwingUp:
     def _reward(self, change: Array) -> Array:
         """Return the reward for height and nearness to rest upright, less the costs of effort, change and travel.
 
-        Each joint that turns adds as much for rest upright: if one of two spins with the other upright, height and
-        energy are near those of rest.
+        Each turning joint adds as much for rest upright: else one of two could spin with the other upright.
         """
         n, turns = self._n, self._turns
         x, v = self.motion[:, :n], self.motion[:, n : 2 * n]
@@ -187,8 +180,7 @@ class SwingUp:
     def start_at(self, rows: NDArray[np.intp], states: Array, efforts: Array) -> None:
         """Move rows of episodes that just began to other starts.
 
-        ``states``: deviations from upright and velocities, shape (k, 2n); ``efforts`` act already and equal the last
-        commands, shape (k, m).
+        ``states``: deviations from upright and velocities, shape (k, 2n); ``efforts``: last commands, shape (k, m).
         """
         n = self._n
         self.motion[rows] = 0.0
@@ -199,7 +191,6 @@ class SwingUp:
         self._samples[rows] = np.tile(self._measure(rows), (1, self.task.history))
 
     def _hold(self, rows: NDArray[np.intp], held: Callable[[Array, Array, NDArray[np.bool_]], Array]) -> None:
-        """Start some at rest where the effort of the one joint holds them."""
         draw, n = self._generator, self._n
         efforts = self.limit * np.clip(draw.uniform(-_FULL, _FULL, (rows.size, n)), -1.0, 1.0)
         above = draw.uniform(0.0, 1.0, rows.size) < 0.5
@@ -215,7 +206,6 @@ class SwingUp:
         return found
 
     def _draw_plants(self, rows: NDArray[np.intp]) -> None:
-        """Draw parameters, again if they make no plant, as independent masses and inertias may."""
         for _ in range(_MOST_DRAWS):
             for name, (low, high) in self._ranges.items():
                 if name.rpartition(".")[2] != "static_friction":

@@ -51,11 +51,10 @@ class Trial:
 def trials_of(
     policy: Policy, task: SwingUpTask, count: int, seed: int, duration: float = 10.0, *, hanging: bool = False
 ) -> list[Trial]:
-    """Return ``count`` trials with start, plant, delay and kicks drawn from the ranges of training.
+    """Return ``count`` trials of ``duration`` [s] with start, plant, delay and kicks from the ranges of training.
 
-    They last ``duration`` [s]. Kicks last 50 ms and come each second, with up to the trained share of the effort limit,
-    or of the largest torque of gravity at a joint without a motor. ``hanging`` starts at rest without kicks, for a
-    policy that knows one way up only.
+    Kicks last 50 ms, one each second, with up to the trained share of the effort limit, or of the largest torque of
+    gravity at a joint without a motor. ``hanging`` starts at rest without kicks.
     """
     rng = np.random.default_rng(seed)
     found = []

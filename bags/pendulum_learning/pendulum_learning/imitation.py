@@ -32,11 +32,7 @@ _NOISE = 0.02
 
 
 class Imitation:
-    """A learner like :class:`pendulum_learning.ppo.Ppo` that fits a teacher's commands.
-
-    Args:
-        environment: The plants; episodes start along the teacher's swing-up.
-    """
+    """A learner like :class:`pendulum_learning.ppo.Ppo` that fits a teacher's commands along its swing-up."""
 
     def __init__(
         self, environment: SwingUp, settings: PpoSettings, generator: np.random.Generator, teacher: Teacher
@@ -52,7 +48,7 @@ class Imitation:
         """Gather states with the present policy and fit it to the teacher's commands there.
 
         ``remaining`` is the remaining share of the training. Returns mean reward per step, mean squared command error
-        as ``divergence``, no spread. Raises a FaultError for a parameter that is not finite.
+        as ``divergence``, no spread, or raises a FaultError for a parameter that is not finite.
         """
         seen, taught, reward = self._gather(max(0.0, 1.0 - (1.0 - remaining) / _LED))
         rate = _LAST_RATE + (_FIRST_RATE - _LAST_RATE) * remaining
@@ -72,7 +68,6 @@ class Imitation:
         return {"reward": reward, "divergence": float(np.mean(losses)), "spread": 0.0}
 
     def _gather(self, led: float) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-        """Return observations and the teacher's commands, shapes (N, k) and (N, m), and the mean reward."""
         env, draw = self.environment, self.generator
         follows = draw.random(env.count) < led
         seen, taught, rewards = [], [], []

@@ -54,17 +54,13 @@ class PpoSettings:
     """Settings of the learner.
 
     Attributes:
-        hidden: Widths of the hidden layers.
         horizon: Steps of each environment between two updates.
         discount: Weight of a reward one step later.
         trace: Weight of longer returns (lambda).
-        epochs: Passes over the data of an update.
-        batches: Parts of a pass.
+        epochs: Passes over the data of an update, each in ``batches`` parts.
         clip: Largest rewarded change of the probability ratio.
-        rate: First learning rate.
-        divergence: Target distance between old and new policy (Kullback-Leibler).
-        spread: First standard deviation of actions.
-        least_spread: Smallest one.
+        divergence: Target Kullback-Leibler distance between old and new policy.
+        spread: First standard deviation of actions, at last ``least_spread``.
     """
 
     hidden: tuple[int, ...] = (64, 64)
@@ -81,7 +77,7 @@ class PpoSettings:
 
 
 class _Old(NamedTuple):
-    """The policy that gathered the data: its actions, their means and log probabilities, and its log spread."""
+    """The policy that gathered the data: actions, their means and log probabilities, log spread."""
 
     actions: Floats
     means: Floats
@@ -108,7 +104,7 @@ class Ppo:
         """Gather data with the present policy and improve it.
 
         ``remaining`` is the remaining share of the training, which caps the learning rate. Returns mean reward per
-        step, divergence, spread and the critic's loss. Raises a FaultError for a parameter that is not finite.
+        step, divergence, spread and the critic's loss, or raises a FaultError for a parameter that is not finite.
         """
         data, reward = self._gather()
         measured = self._improve(data, remaining)
@@ -178,7 +174,6 @@ class Ppo:
         }
 
     def _follow_advantages(self, x: Floats, old: _Old, gain: Floats, remaining: float) -> float:
-        """Take a step of the actor; return the policy's distance from the old one."""
         s, size = self.settings, len(x)
         mean = self.actor.forward(x)
         variance = np.exp(2.0 * self.log_spread)
@@ -226,7 +221,6 @@ def finite_or_diverged(parameters: Iterable[Floats]) -> None:
 
 
 def _log_chance(actions: Floats, means: Floats, log_spread: Floats) -> Floats:
-    """Return the log probability of actions, up to a constant, shape (n, 1)."""
     scaled = (actions - means) * np.exp(-log_spread)
     return np.sum(-0.5 * scaled * scaled - log_spread, axis=1, keepdims=True, dtype=np.float32)
 

@@ -25,8 +25,7 @@ class SwingUpTask:
 
     Attributes:
         period: Time between two commands [s].
-        share: Half width of each parameter's range, as a share of its value [-]; a wider interval of the plant file
-            overrides it.
+        share: Half width of each parameter's range, as a share of its value, unless the plant file's is wider [-].
         delay: Longest mean delay from state to torque, drawn from 0 up to this in each episode [s].
         jitter: Standard deviation of the delay from command to command [s].
         angle_noise: Standard deviation of measured angles [rad].
@@ -70,10 +69,9 @@ class SwingUpTask:
 def ranges_of(
     plant: PlantParameters, share: float, intervals: Mapping[str, Sequence[float]]
 ) -> dict[str, tuple[float, float]]:
-    """Return the range of each parameter that varies in training, static friction among them.
+    """Return the range of each parameter that varies in training, by name; gravity does not.
 
-    Of a mechanism these are its own parameters but gravity, and the friction of its joints. ``share`` is the half width
-    as a share of the value [-], ``intervals`` are those of the plant file, by name.
+    ``share`` is the half width as a share of the value [-], ``intervals`` are those of the plant file.
     """
     if not plant.is_pendulum:
         numbers = plant.numbers

@@ -154,7 +154,6 @@ def _settings(
 
 
 def _write_curves(out: Path, settings: Training, curves: Any) -> Path:
-    """Draw the curves of a training, as it returns them, next to the policy file; return the path."""
     from pendulum_bags.figures.figure import Figure, Panel, Trace
     from pendulum_bags.figures.render_files import write_figures
 

@@ -47,10 +47,9 @@ _SPEED_MARGIN = 1.1
 
 @dataclass(frozen=True)
 class Training:
-    """Settings of a training.
+    """Settings of a training of a number of ``environments``.
 
-    ``intervals`` of the plant's parameters are as in a plant file; ``swing_up`` has the variations between episodes;
-    ``environments`` is the number of pendulums at once.
+    ``intervals`` of the plant's parameters are as in a plant file; ``swing_up`` has the variations between episodes.
     """
 
     task: str = "swing_up"
@@ -124,7 +123,7 @@ def train(
         The policy, and its curves: steps, mean reward, divergence and spread per update, shape (n, 4).
 
     Raises:
-        ParameterError: A checkpoint of other settings is in the way.
+        ParameterError: There is a checkpoint of other settings.
         DataError: The file or the checkpoint cannot be written or read.
         FaultError: The training diverged; the last checkpoint remains.
     """
@@ -237,7 +236,7 @@ def _keep(
 def _check_arrays(
     path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo | Imitation, joints: int, updates: int
 ) -> None:
-    """Refuse arrays that do not fit the settings; numpy would broadcast or cast them silently."""
+    """Refuse arrays that do not match the settings: numpy would broadcast or cast them silently."""
     expected = {f"learner/{name}": np.asarray(each) for name, each in learner.state().items()}
     expected |= {f"environment/{name}": each for name, each in learner.environment.state().items()}
     for name in (*expected, "curves", "fastest"):
@@ -265,7 +264,6 @@ def _check_arrays(
 def _restore(
     path: Path, settings: Training, learner: Ppo | Imitation, generator: np.random.Generator
 ) -> tuple[list[list[float]], NDArray[np.float64]]:
-    """Resume from a checkpoint; return the curves so far and each joint's fastest motion [rad/s or m/s]."""
     try:
         if path.stat().st_size > _LARGEST_CHECKPOINT:
             raise DataError(f"checkpoint {path} has more than {_LARGEST_CHECKPOINT} bytes; expected one of ours")

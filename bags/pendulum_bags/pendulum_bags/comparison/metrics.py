@@ -51,7 +51,6 @@ def _integral(episode: Episode, values: Array) -> float:
 
 
 def _overshoot(episode: Episode) -> float:
-    """Largest excursion beyond the set-point, as a share of the step."""
     if episode.step == 0.0:
         return float("nan")
     return float(max(0.0, np.max(-episode.error / episode.step)))

@@ -222,7 +222,6 @@ class _Seen:
         self.clock = SlowClock(stamps[(stamps >= start) & (stamps <= stop)], band)
 
     def _both(self, delay: float) -> tuple[Array, Array]:
-        """Return simulation and hardware, each with angle, velocity and torque, shape (n, 3), band-limited."""
         times = self.clock.times
         shifts = (0.0, delay) if self.is_slower else (-delay, 0.0)
         first, second = (

@@ -67,7 +67,6 @@ class HostedProgram:
             self._host.process.send_signal(number)
 
     def _listen(self, enough: Callable[[], bool], timeout: float | None) -> None:
-        """Read the host's lines until they suffice, at most for ``timeout`` [s]."""
         deadline = None if timeout is None else time.monotonic() + timeout
         while not enough():
             left = None if deadline is None else max(0.0, deadline - time.monotonic())

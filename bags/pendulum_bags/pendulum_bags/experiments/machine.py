@@ -140,7 +140,6 @@ class Machine:
             raise FaultError(reason)
 
     def _ended(self, bag: Path) -> tuple[bool, str] | None:
-        """Return whether the plant stopped and why, without reason for a complete bag; None before its end."""
         if self._child is not None:
             with self._child.log.open("rb") as log:
                 log.seek(self._read)

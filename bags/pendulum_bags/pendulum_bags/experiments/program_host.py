@@ -57,7 +57,6 @@ def main() -> int:
 
 
 def _run(order: Mapping[str, Any], on_begin: Callable[[], None]) -> int:
-    """Run one program; return its exit code."""
     os.environ.clear()
     os.environ.update(order["environment"])
     os.chdir(order["folder"])

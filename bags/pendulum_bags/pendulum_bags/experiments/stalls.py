@@ -64,7 +64,6 @@ def run_undisturbed(run: Callable[[], None], folder: Path, *, emulated: bool, te
 
 
 def _clear(folder: Path, attempt: int) -> None:
-    """Remove the bags of an aborted run; its logs stay, under the run's number."""
     for bag in ("sim", "hw", "sim_500hz", REPEATS):
         shutil.rmtree(folder / bag, ignore_errors=True)
     logs = folder / _LOGS

@@ -153,7 +153,6 @@ def _draw(figure: Figure, canvas_type: Any) -> Any:
 
 
 def _has_offset(ax: Axes) -> bool:
-    """Return whether the y axis has a common factor or offset above it, which the title must avoid."""
     formatter = ax.yaxis.get_major_formatter()
     formatter.format_ticks(ax.yaxis.get_majorticklocs().tolist())
     return bool(formatter.get_offset())

@@ -91,7 +91,6 @@ def _graph(figure: Figure, panels: list[Panel]) -> dict[str, Any]:
 
 
 def _log_ticks(values: list[NDArray[np.float64]]) -> dict[str, Any]:
-    """Return ticks at 1, 2, 5 of each decade, or at many decades only, as numbers."""
     joined = np.concatenate(values)
     joined = joined[joined > 0.0]
     if not joined.size:

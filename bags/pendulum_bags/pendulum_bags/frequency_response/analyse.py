@@ -93,7 +93,7 @@ def _read(path: Reading) -> tuple[Record, Mapping[str, Any]]:
 
 
 def _design_plant(bag: Path, facts: Mapping[str, Any]) -> str:
-    """Return the plant file or preset that a run's controller was designed on, perhaps next to its bag; or empty."""
+    """Return the plant file or preset of a run's design, perhaps next to its bag, or ""."""
     controller = facts.get("controller")
     linearised = controller.get("linearised") if isinstance(controller, Mapping) else None
     if isinstance(linearised, str) and (bag.parent / linearised).is_file():

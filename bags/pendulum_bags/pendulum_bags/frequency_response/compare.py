@@ -119,7 +119,6 @@ def compare_responses(
 
 
 def _at_common_lines(first: MeasuredResponse, second: MeasuredResponse) -> tuple[Array, Complex, Array, Complex, Array]:
-    """Return frequencies, and response and deviation of both there; the first is interpolated where lines differ."""
     apart = np.abs(second.frequency[:, None] - first.frequency[None, :])
     nearest = apart.argmin(axis=1)
     same = apart[np.arange(second.frequency.size), nearest] < 1e-6 * second.frequency

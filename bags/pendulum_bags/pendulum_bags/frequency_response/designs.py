@@ -235,7 +235,6 @@ def policies_of(record: Mapping[str, Any]) -> list[str]:
 
 
 def _policy(path: str, plant: PlantParameters, certifier: Certifier, *, recorded: bool) -> DesignResult:
-    """Return the certificate of a learned policy around upright, by its responses to disturbances of two sizes."""
     machine = certifier.machine
     name, text = f"policy {Path(path).name}", str(Path(path).expanduser().resolve())
     nothing = certifier.feedback(np.zeros((2, machine.frequency.size), dtype=np.complex128), stable=False)

@@ -161,7 +161,6 @@ def _joint(record: Record, frequency: Array, r: Complex, u: Complex, y: Complex,
 
 
 def _distortion(y: Complex, harmonics: NDArray[np.int64]) -> tuple[float, float]:
-    """Return the worst joint's angle and velocity on odd lines, relative to those on the excited lines."""
     top = min(int(harmonics[-1]), y.shape[2] - 1)
     odd = np.setdiff1d(np.arange(1, top + 1, 2), harmonics)
     excited = harmonics[harmonics <= top]

@@ -44,7 +44,6 @@ def response_figures(analysis: Analysis) -> list[Figure]:
 
 
 def _channels(measured: MeasuredResponse, scaling: SignalScaling) -> list[tuple[int, str, Callable[[Complex], Array]]]:
-    """Return the outputs of a Bode plot, top to bottom: index, label, and plotted function."""
     if not isinstance(scaling, JointScaling):
         return [
             (0, "angle per torque\n[rad/(N m)]", np.abs),
@@ -236,7 +235,6 @@ def certified_gains_figure(certifier: Certifier, designs: Sequence[DesignResult]
 
 
 def _class(certifier: Certifier, K: Array) -> int:
-    """Return 0 for certified, 1 for stable on the model only, 2 for neither."""
     found = certifier.gain(K)
     return 0 if found.certified else 1 if found.stable_on_model else 2
 

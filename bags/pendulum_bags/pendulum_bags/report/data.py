@@ -90,6 +90,5 @@ def read_trials(folder: str | os.PathLike[str]) -> TrialSet:
 
 
 def _cut(recording: Recording) -> Recording:
-    """Return the trial alone, with the measured effort at the stamps of the states, where it was measured."""
     part = trial_part(recording)
     return replace(part, input=np.interp(part.time, part.input_stamps, part.input), input_time=None)

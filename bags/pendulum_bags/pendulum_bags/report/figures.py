@@ -22,7 +22,6 @@ Maker = Callable[[ReportData], Figure | str]
 
 
 def _of_experiment(number: int, draw: Callable[[TrialSet], Figure | str]) -> Maker:
-    """Return a function that draws a figure from an experiment's trials, or returns that they are missing."""
     kind = {1: "inertia_damping", 2: "gravity"}[number]
 
     def make(data: ReportData) -> Figure | str:
@@ -33,8 +32,6 @@ def _of_experiment(number: int, draw: Callable[[TrialSet], Figure | str]) -> Mak
 
 
 def _certified(draw: Callable[[Analysis, Certifier], Figure]) -> Maker:
-    """Return a function that draws a figure of certified designs, or returns that a measured machine is missing."""
-
     def make(data: ReportData) -> Figure | str:
         found = data.certified
         if found is None or found.certifier is None:

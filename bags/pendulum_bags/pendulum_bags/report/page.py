@@ -148,7 +148,6 @@ def render_page(page: Page, pictures: Mapping[str, bytes]) -> str:
 
 
 def _lead(figure: Figure) -> Figure:
-    """Return the first panel of the motions, small, for the first screen."""
     return replace(figure, name="lead", title="The motion under one noise", sentence="", panels=figure.panels[:1])
 
 
@@ -179,7 +178,6 @@ def _facts(data: ReportData) -> list[tuple[str, str]]:
 
 
 def _without_mark(answer: Answer) -> str:
-    """Return the answer's sentence without the mark that stands above it."""
     text = answer.sentence.removeprefix(f"{answer.mark.value.capitalize()}: ")
     return text[0].upper() + text[1:]
 

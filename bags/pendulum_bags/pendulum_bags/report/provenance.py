@@ -152,7 +152,6 @@ def emulator_table(data: ReportData) -> Table | None:
 
 
 def _emulated_plant(run: RunData, open_bag: OpenBag) -> PlantParameters | None:
-    """Return the plant with a drivetrain of a run's diagnostics."""
     space = str(run_record(run.metadata).get("namespace", "")).rstrip("/") + "/"
     try:
         with open_bag(run.source) as bag:
@@ -205,7 +204,6 @@ def citation(version: str, revision: str, year: str = "n.d.") -> str:
 
 
 def _plant_in_words(plant: PlantParameters) -> str:
-    """Return the parameters of a plant that are not zero, with units."""
     constants = [
         f"{spec.name} {quantity(float(value), '' if spec.unit == '-' else typeset(spec.unit), 5)}"
         for spec in PLANT_SPECS

@@ -293,8 +293,6 @@ def unwrap(recording: Recording) -> Recording:
 
 
 class _Named(Protocol):
-    """A recording, of one joint or several."""
-
     @property
     def name(self) -> str: ...
 

@@ -89,7 +89,6 @@ def _again(record: Mapping[str, Any], plant: str, seen: Set[str]) -> str:
 
 
 def _is_experiment(words: Sequence[str]) -> bool:
-    """Return whether a command compares two plants."""
     return words[:4] == ["python", "-m", "pendulum_bags", "experiment"] and " ".join(words[4:5]) in _EXPERIMENTS
 
 

@@ -158,11 +158,7 @@ def joints_of(
 def shared_joints(
     readings: Sequence[Reading], prefixes: tuple[str | None, str | None] = (None, None), *, open_bag: OpenBag = read_bag
 ) -> dict[str, str | None]:
-    """Return the joints that a simulation and its hardware have both, and their names at the hardware if others.
-
-    Raises:
-        DataError: The recordings have no joint in common.
-    """
+    """Return the joints that both recordings have, and the hardware's names if they differ, or raise a DataError."""
     ours = joints_of(readings[0], prefixes[0], open_bag=open_bag)
     every = [joints_of(reading, prefixes[1], open_bag=open_bag) for reading in readings[1:]]
     theirs = every[0]

@@ -15,7 +15,6 @@ __all__ = ["Series", "Signal", "shared_span", "uniform_times", "unwrap_near_upri
 
 
 def _as_columns(name: str, t: ArrayLike, columns: dict[str, ArrayLike], least: int) -> dict[str, Array]:
-    """Return float arrays of one length, checked; ``t`` is among them."""
     arrays = {key: np.ascontiguousarray(value, dtype=float) for key, value in {"t": t, **columns}.items()}
     size = arrays["t"].size
     if size < least:

@@ -367,7 +367,6 @@ class _KnockDowns:
 
 
 def _gravity(plant: PlantParameters, x: Vector) -> Vector:
-    """Return the torques of both joints that hold the arms against gravity [N m]."""
     potential, p = in_arithmetic(plant.mechanism.potential, cmath), plant.packed
     return tuple(complex_step(lambda *q: (potential(q, p),), x[:2])[0])
 

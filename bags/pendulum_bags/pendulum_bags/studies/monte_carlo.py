@@ -100,8 +100,6 @@ class MonteCarlo(ClosedLoops):
 
 
 class _Names(NamedTuple):
-    """Names of the columns of a plant: of each joint, and ``effort`` of each driven one."""
-
     start: tuple[str, ...]
     farthest: tuple[str, ...]
     spread: tuple[str, ...]

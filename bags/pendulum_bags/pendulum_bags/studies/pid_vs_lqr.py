@@ -81,7 +81,6 @@ def _text(value: float | None) -> str:
 
 
 def _mean_response(episodes: Sequence[Episode]) -> dict[str, Any]:
-    """Return the metrics of the step response averaged over seeds, with bootstrap intervals over the seeds."""
     errors = np.stack([episode.error for episode in episodes])
     first = episodes[0]
 

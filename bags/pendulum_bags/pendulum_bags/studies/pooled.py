@@ -77,6 +77,5 @@ def print_table(console: Console, result: Mapping[str, Any]) -> None:
 
 
 def _mean(values: Sequence[float]) -> dict[str, float | None]:
-    """Return mean and 95 % interval of runs that differ in their seed (Student's t)."""
     mean, low, high = mean_interval(values)
     return {"mean": mean, "low": low, "high": high} if len(values) > 1 else {"mean": mean, "low": None, "high": None}

@@ -292,7 +292,6 @@ class RegionResult:
         return UPRIGHT + angle, velocity
 
     def _area(self, where: NDArray[np.bool_]) -> float:
-        """Return the area of starts of one joint within the grid [rad^2/s]."""
         theta, theta_dot = self.axes
         return float(np.count_nonzero(where)) * float((theta[1] - theta[0]) * (theta_dot[1] - theta_dot[0]))
 

@@ -195,5 +195,4 @@ def write_table(path: Path, records: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _is_step(spec: RunSpec) -> bool:
-    """Return whether the run starts elsewhere than at its set-point."""
     return abs(wrap(spec.theta - UPRIGHT - spec.set_point)) > _LEAST_STEP

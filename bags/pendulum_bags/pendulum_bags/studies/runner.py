@@ -160,8 +160,6 @@ def run_study(
 
 @dataclass
 class _Running:
-    """A run under way: a child process, or a job of a thread."""
-
     run: StudyRun
     folder: Path
     started: float

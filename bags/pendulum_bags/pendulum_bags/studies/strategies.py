@@ -148,7 +148,6 @@ def _add_gaps(rows: Sequence[dict[str, Any]], motions: Mapping[str, tuple[Array,
 
 
 def _figure(rows: Sequence[Mapping[str, Any]], motions: Mapping[str, tuple[Array, Array]]) -> Figure:
-    """Draw a stretch of each motion over that of the simulation, with the damping that was identified from it."""
     twin = next((row for row in rows if row["side"] == "sim"), None)
     panels: list[Panel] = []
     for row in rows:

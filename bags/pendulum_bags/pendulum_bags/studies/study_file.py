@@ -209,7 +209,6 @@ def load_study(
 
 
 def _law(file: LocatedMapping, name: str, entry: LocatedMapping) -> tuple[str, dict[str, Any]]:
-    """Return kind and parameters of a controller; the path of a policy begins at the study's folder."""
     values = dict(entry.values)
     if (kind := values.pop("kind", name)) == "policy":
         path = file.path.resolve().parent / Path(str(values.get("policy", ""))).expanduser()

@@ -139,7 +139,7 @@ def uncertain_names(plant: PlantParameters) -> Sequence[str]:
 
 
 def _share_of_interval(interval: Sequence[float], value: float) -> float:
-    """Return the standard deviation that a 95 % interval stands for, as a share of the value, 1 at most."""
+    """Return the standard deviation of a 95 % interval, as a share of the value, 1 at most."""
     low, high = interval
     return float(min(1.0, abs((high - low) / (2.0 * _NORMAL_95 * value)))) if value else 0.0
 

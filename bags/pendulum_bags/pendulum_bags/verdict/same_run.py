@@ -195,7 +195,6 @@ def simulated_plant(comparison: Comparison) -> str:
 
 
 def _each_once(failed: Sequence[EquivalenceTest]) -> list[EquivalenceTest]:
-    """Leave out distances that a reported delay or spread explains."""
     plain = [test for test in failed if not test.quantity.startswith("distance")]
     return plain or list(failed)
 

@@ -240,8 +240,6 @@ def carry_out(
 
 
 class _Run:
-    """The steps of a run, and what they share."""
-
     def __init__(
         self, folder: Path, order: Order, progress: PhaseProgress, on_first: Callable[[Simulated], None]
     ) -> None:
@@ -355,7 +353,6 @@ class _Run:
         )
 
     def _repeat(self, folder: Path, settings: Settings, number: int, deadline: Deadline) -> None:
-        """Record a repeat; the hardware's in a program of its own, so that this one has a graph once only."""
         bag = repeat_folder(folder, number) / "hw"
         run = MachineRun(bag, lockstep_spec(repeat_settings(settings, number), side="hw"))
         if run.spec.has_bridge and not bag.exists():
@@ -409,7 +406,6 @@ class _Run:
         self.programs.stop()
 
     def _begin_identification(self) -> None:
-        """Identify a plant from what the given one was compared with."""
         given = self.found.given
         self._phase("identifying the plant", 0.5)
         words = ["identify", *recordings_of(given.comparison), "--out", str(self.folder / PLANT_FILE), "--json"]
@@ -423,7 +419,6 @@ class _Run:
         )
 
     def _end_identification(self) -> None:
-        """Compare the identified plant under noise of another seed."""
         assert self.identification is not None
         deadline, file, place = self.found.deadline, self.folder / PLANT_FILE, self.folder / IDENTIFIED
         self._phase("identifying the plant", 12.0)
@@ -448,7 +443,6 @@ class _Run:
         self._compare(self.found.identified, deadline.share(_SHARE))
 
     def _frequencies(self, plant: Simulated) -> None:
-        """Compare a plant with the machine in frequency, and certify designs on it."""
         excited = 0.0 if plant is self.found.identified else self.order.recording_time(self.multisine.duration)
         self._phase(f"frequencies of {plant.name}", 3.0 + excited)
         own, machine = plant.folder / MULTISINE / "sim", self.folder / MULTISINE / "hw"
@@ -529,7 +523,6 @@ def _of(plant: Simulated, spec: RunSpec) -> RunSpec:
 
 
 def _refusal(identification: Child) -> str:
-    """Return why an identification refused its recordings, or its last output."""
     try:
         # What refuses comes first.
         return str(json.loads(identification.log.read_text(encoding="utf-8"))["sentences"][0])

@@ -80,8 +80,8 @@ class _Plant:
 class Hub:
     """The console's end of the graph; requests raise FaultError with the reason of a refusal.
 
-    States and torques come at up to 2 kHz and are drawn at 60 Hz. Their inputs hold one message and are polled per
-    frame, so messages that are not drawn cost no Python.
+    States and torques come at up to 2 kHz and are drawn at 60 Hz, so their inputs hold one message and are polled per
+    frame.
     """
 
     def __init__(self) -> None:
@@ -184,7 +184,7 @@ class Hub:
         return await self.trigger(f"{node}/e_stop_reset")
 
     def _keep_stopping(self) -> None:
-        """Repeat requests in a thread of its own, so that neither page nor server delays a stop."""
+        """Repeat requests in a thread of its own: neither page nor server may delay a stop."""
         while not self._leaving.is_set():
             with self._order_lock:
                 now = time.monotonic()

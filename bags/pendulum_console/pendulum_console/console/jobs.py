@@ -139,12 +139,7 @@ class Jobs:
 
 
 class NewestPage:
-    """The newest page of a name, which is shown again only when it changed.
-
-    Attributes:
-        folder: The run folder that holds it; None if there is none.
-        written: Time of writing [s of the system clock].
-    """
+    """The newest page of a name; ``folder`` is its run folder or None, ``written`` the system time of writing [s]."""
 
     def __init__(self, jobs: Jobs, page: str) -> None:
         self._jobs = jobs

@@ -76,5 +76,4 @@ class JointValues:
 
 
 def _joints(names: tuple[str, ...]) -> tuple[Joint, ...]:
-    """Return the joints of the mechanism with these names, or hinges from 0 if none is known."""
     return _KNOWN[names].joints if names in _KNOWN else tuple(Joint(name) for name in names)

@@ -47,8 +47,8 @@ def listen(host: str, port: int, backlog: int = 1) -> socket.socket:
 def refusal(headers: dict[str, str], query: str, token: str) -> str:
     """Return why a request is refused, or an empty text; ``headers`` are by lower-case name.
 
-    A page of another site in the same browser could otherwise send requests (with its own ``Origin``), or impersonate
-    the console under a name that it resolves to this machine (``Host``). ``token`` is empty if only loopback is served.
+    Another site in the same browser could send requests (with its own ``Origin``), or impersonate the console under a
+    name that it resolves to this machine (``Host``). ``token`` is empty on loopback.
     """
     host = headers.get("host", "")
     name = urlsplit(f"//{host}").hostname or ""
@@ -89,7 +89,7 @@ class Guard:
             await send({"type": "http.response.body", "body": reason.encode()})
 
     def _keep(self, send: Send) -> Send:
-        """Return a ``send`` with the token as a cookie, so that the page's own requests carry it."""
+        """Return a ``send`` that sets the token as a cookie for the page's own requests."""
         if not self._token:
             return send
 

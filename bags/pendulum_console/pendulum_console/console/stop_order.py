@@ -1,7 +1,7 @@
 """A stop that stays in force: repeated to every plant until each has confirmed and the operator acknowledges.
 
-A plant may be frozen, restarting or unreachable at the time of the stop. So every plant that is known, or appears
-meanwhile, gets requests until it confirms, and further ones in case it restarts.
+A plant may be frozen, restarting or unreachable at the time of the stop: every plant that is known or appears gets
+requests until it confirms, and further ones in case it restarts.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ SILENT_AFTER = 1.5
 
 @dataclass
 class _Row:
-    """Requests to and responses of one plant; times in seconds of the caller's clock."""
+    """Requests to and responses of one plant [s of the caller's clock]."""
 
     pressed: float
     asked: float = float("-inf")
@@ -109,8 +109,8 @@ class StopOrder:
         """Return the state to show; None without a stop in force.
 
         ``since`` is the time since the order [s], ``all`` whether it was for all plants. A row's ``state`` is ``asked``
-        (no response yet), ``stopped`` or ``silent`` (once confirmed, no longer), ``after`` the time to the first
-        response and ``silent_for`` that since the last [s].
+        (no response yet), ``stopped`` or ``silent`` (once confirmed), ``after`` the time to the first response and
+        ``silent_for`` that since the last [s].
         """
         if self._pressed is None:
             return None

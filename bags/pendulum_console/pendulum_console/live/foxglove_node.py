@@ -48,12 +48,7 @@ _E_STOP = f"/{names.E_STOP.removeprefix('~/')}"
 
 @dataclass(frozen=True)
 class LiveOptions:
-    """Where to listen, and which clients to admit.
-
-    Args:
-        port: Port; 0 for any.
-        token: Token of a client; empty on loopback.
-    """
+    """Listening port (0 for any), and the token of clients (empty on loopback)."""
 
     host: str = "127.0.0.1"
     port: int = 8765
@@ -275,8 +270,6 @@ class _Listener(ServerListener):
 
 
 def _start_server(listener: Any, domain: int, context: Any) -> tuple[Any, str]:
-    """Return the library's server and the address at which only this program finds it."""
-
     def start(host: str) -> Any:
         return foxglove.start_server(
             name=f"pendulum, ROS domain {domain}",

@@ -29,8 +29,8 @@ _END = b"\r\n\r\n"
 class Gate:
     """Listens at ``port`` (0 for any), and connects admitted clients to a server at an address and port.
 
-    ``refusal`` returns why a request is refused, or nothing; ``tell`` gets a line on each client that connects, leaves
-    or is refused; both are called in any thread. A ParameterError if address or port are not available.
+    ``refusal`` returns why a request is refused, or nothing; ``tell`` gets a line on each client; both are called in
+    any thread. A ParameterError if address or port are not available.
     """
 
     def __init__(
@@ -138,7 +138,6 @@ class Gate:
 
 
 def _read_head(source: socket.socket) -> tuple[bytes, bytes]:
-    """Return a head with its empty line, and the bytes after it; an OSError if none arrives."""
     data = b""
     while _END not in data:
         piece = source.recv(4096)

@@ -1,7 +1,7 @@
 """Access control of websockets: local programs and viewers, pages that the user named, the token.
 
-Any site open in a local browser can reach ``localhost`` and a service that arms a plant, but the browser sends the
-page's ``Origin``, which distinguishes it from a viewer.
+Any site open in a local browser can reach ``localhost`` and a service that arms a plant; the browser's ``Origin``
+header distinguishes it from a viewer.
 """
 
 from __future__ import annotations
@@ -53,10 +53,7 @@ def parse(head: bytes) -> Request:
 
 
 def refusal(request: Request, token: str, origins: Collection[str] = ()) -> str:
-    """Return why a request is refused, or an empty text.
-
-    ``token`` is empty if only loopback is served; ``origins`` of pages need none, like the known viewers.
-    """
+    """Return why a request is refused, or an empty text; ``token`` is empty on loopback, ``origins`` need none."""
     if token:
         given = parse_qs(request.query).get("token", [""])[0]
         if hmac.compare_digest(given.encode(), token.encode()):

@@ -22,7 +22,7 @@ _DEPTH = 2000
 class LiveTopic:
     """A topic (of type ``package/msg/Name``) and its channel in the viewers' server; or an ImportError.
 
-    ``lost`` are messages missing between the ``sent`` ones, by sequence number; counted while there is one publisher.
+    ``lost`` messages are missing between ``sent`` ones by sequence number, counted while there is one publisher.
     """
 
     def __init__(self, node: PollingNode, topic: str, type_name: str, context: Any) -> None:

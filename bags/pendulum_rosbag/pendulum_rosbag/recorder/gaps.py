@@ -17,7 +17,7 @@ _PATIENCE = 200
 class _Doubt:
     """A sample that continues no publisher: ``gap`` samples of the nearest one are missing, or it is another's first.
 
-    ``unmet`` samples came before it in the second case; ``patience`` samples of the topic later the first is assumed.
+    ``unmet`` samples came before it in the second case, which is assumed ``patience`` samples later.
     """
 
     gap: int
@@ -28,11 +28,9 @@ class _Doubt:
 class GapCounter:
     """Follows the sequence numbers of one topic and counts the missing ones.
 
-    DDS numbers the samples of each publisher from 1, but rclpy does not report whose a sample is. So each publisher is
-    remembered by its last number, and a sample belongs to the publisher that it continues. Otherwise it is the first of
-    a new publisher (which may have published before the match) or follows a gap. If more publishers were matched than
-    received from, later samples decide: the publisher that it could continue sends more, or has left, or the gap was
-    real.
+    DDS numbers the samples of each publisher from 1, but rclpy does not report the publisher. So each publisher is
+    represented by its last number, and a sample belongs to the publisher that it continues; otherwise it is the first
+    of a new publisher or follows a gap. If more publishers were matched than received from, later samples decide.
 
     Args:
         matched: Returns how many publishers were ever matched, and how many are now.
@@ -94,7 +92,6 @@ class GapCounter:
         return gap
 
     def _judge_doubts(self, continued: int) -> int:
-        """Resolve the case of a publisher that sends more; return the gaps of publishers that stayed silent."""
         if continued in self._doubts:
             self.unmet += self._doubts.pop(continued).unmet
         found = 0

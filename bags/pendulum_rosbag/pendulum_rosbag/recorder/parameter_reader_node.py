@@ -25,8 +25,7 @@ _PATIENCE = 50  # graph polls after which a node that does not respond is given 
 class ParameterReader:
     """Requests the parameters of each node that appears, and follows their changes.
 
-    ``on_values`` is called with all values so far (node -> parameter -> value) and the name of a node whose parameters
-    changed after they were first read (else empty).
+    ``on_values`` is called with all values (node -> parameter -> value) and the node with a change, or "".
     """
 
     def __init__(self, node: Node, on_values: Callable[[Mapping[str, Mapping[str, Any]], str], None]) -> None:
@@ -62,7 +61,7 @@ class ParameterReader:
         return self._node.create_client(kind, f"{full}/{service}")
 
     def _offers(self, full: str) -> bool:
-        """Return whether the graph shows a node's parameter services: each needless client loads discovery."""
+        """Return whether the graph shows a node's parameter services: needless clients load discovery."""
         space, _, name = full.rpartition("/")
         try:
             offered = self._node.get_service_names_and_types_by_node(name, space or "/")

@@ -53,8 +53,7 @@ SPECS = (
 class Recorder(PollingNode):
     """Subscribes to topics as they appear and hands their bytes to a :class:`RecordingSession`.
 
-    Messages are taken from the middleware every 20 ms rather than dispatched one by one by the executor: a tenth of the
-    cost at the same precision. ``stop`` requests the runner to end the process.
+    Messages are polled every 20 ms, at a tenth of an executor's cost. ``stop`` requests the runner to end the process.
 
     Raises:
         BagError: The output folder exists or cannot be created.
@@ -264,10 +263,7 @@ class Recorder(PollingNode):
         )
 
     def _stamp(self, tap: Tap, data: bytes) -> int | None:
-        """Return the log time by header; unstamped messages get the newest stamp.
-
-        Wall time and simulated time must not mix, so messages before the first stamp wait for it.
-        """
+        """Return the log time by header; unstamped messages get the newest stamp, for which the first ones wait."""
         stamp = tap.stamp(data) if tap.stamp is not None else None
         if stamp is None or stamp < 0:
             return self._newest_stamp or None

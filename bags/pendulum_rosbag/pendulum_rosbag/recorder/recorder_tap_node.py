@@ -41,7 +41,7 @@ def wanted_qos(publishers: Sequence[TopicEndpointInfo]) -> tuple[bool, bool]:
 class Tap:
     """A polled subscription, and what is needed to record from it; an ImportError if the type is not installed.
 
-    It may replace the subscription ``before``; messages missed between them are counted, too. The node destroys
+    Messages missed between it and the subscription ``before`` that it replaces are counted. The node destroys
     ``source`` after ``close``; ``announced`` is the session that has the topic.
     """
 

@@ -35,7 +35,7 @@ class TopicCount:
         missing: Lost before the recorder.
         written: Safe on disk.
         early: Published before the subscription was complete: a gap at the start, not a loss.
-        before: Sent by its publishers before the recording of the topic began.
+        before: Published before the recording of the topic began.
         repeated: Byte-identical repetitions in a recording by header times; the bag holds each once.
     """
 
@@ -218,7 +218,7 @@ class RecordingSession:
                 return
 
     def _run_sync(self) -> None:
-        """Sync in a thread of its own: a slow disk must not delay the seals that bound what a kill costs."""
+        """Sync in a thread of its own: a slow disk must not delay the seals."""
         if not self._sync_interval:
             return
         while not self._stop.wait(self._sync_interval):

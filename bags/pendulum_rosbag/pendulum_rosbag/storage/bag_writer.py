@@ -37,17 +37,15 @@ class _Channels(dict[str, int]):
 class BagWriter:
     """One rosbag2 folder that is being written; all methods are thread-safe.
 
-    Messages wait in memory until ``seal``, which is called whenever ``chunk_size`` bytes have accumulated. Sealed
-    messages survive the death of the process; any rosbag2 reader reads them without repair.
+    Messages wait in memory until ``seal``, which is called at ``chunk_size`` bytes. Flushed messages survive the death
+    of the process; any rosbag2 reader reads them without repair.
 
     Args:
         path: Folder to create; it must not exist.
         storage: ``"mcap"`` or ``"sqlite3"``.
         compression: ``None`` or ``"zstd"`` (MCAP only, chunk by chunk).
         metadata: Run metadata; values that are not strings are stored as JSON text.
-        chunk_size: Message bytes that are sealed together at the latest.
-        max_size: Largest closed storage file [bytes], 0 for no limit. An empty file may take half of it; if it takes
-            more, as much is allowed on top.
+        max_size: Largest closed storage file [bytes], 0 for no limit; at least twice that of an empty file.
         max_duration: Longest time span of a storage file [s], 0 for no limit.
         ros_distro: Distribution named in ``metadata.yaml`` and in a database.
         file_stem: Beginning of the names of storage files; by default the name of the folder.
@@ -55,7 +53,7 @@ class BagWriter:
     Raises:
         BagError: The folder exists or cannot be created; in methods, the writer is closed.
         ParameterError: Unknown storage or compression.
-        OSError: In methods that write: the disk is full or fails. Sealed messages remain readable.
+        OSError: In methods that write: the disk is full or fails. Flushed messages remain readable.
     """
 
     def __init__(

@@ -1,25 +1,24 @@
 """Byte layout of an MCAP file that is complete at every instant while it grows.
 
 MCAP readers start at the footer at the end of the file, so a file that grows by appending is broken when its writer
-dies. This file is laid out with room to grow: a private record that every reader skips::
+dies. This file has space to grow: a private record that every reader skips::
 
-    magic  header | settled chunks | room to grow | staged chunks | summary A | summary B | data end, footer, magic
-                                   ^ settled_end  ^ area.start    ^ area.stop
+    magic  header | settled chunks | space to grow | staged chunks | summary A | summary B | data end, footer, magic
+                                   ^ settled_end   ^ area.start    ^ area.stop
 
-- Chunk and summary are written to unseen places: the summary to whichever of A and B the footer does not name, after a
-  data end (Foxglove's reader needs it there) and with a private checksum record (a footer's checksum would cover the
-  place that is written next). Two small writes make them visible: a record head for sequential readers, then the footer
-  for index readers.
-- Sealing often makes small chunks and a long index, so small chunks are only staged. When enough have accumulated, one
-  large chunk replaces them behind the settled ones; between the two writes readers see the same messages either way.
-  The staging area is reused from its start when full, which leaves a reader of a growing file some megabytes of time.
-- When the room is used up, one write far beyond the end moves the end of the file; the hole occupies no disk space.
+- Chunk and summary are written to invisible places: the summary to whichever of A and B the footer does not name, after
+  a data end (Foxglove's reader needs it) and with a private checksum record (the footer's would cover the place that is
+  written next). Two small writes make them visible: a record head for sequential readers, then the footer for index
+  readers.
+- Frequent seals make small chunks and a long index, so small chunks are only staged. When enough have accumulated, one
+  large chunk replaces them behind the settled ones; readers see the same messages throughout. The full staging area is
+  reused from its start, some megabytes later.
+- When the space is used up, one write far beyond the end moves the end of the file; the hole occupies no disk space.
   ``finish`` cuts the rest off.
 - Each commit lies within one memory page, which the kernel copies as a whole: a process killed at any instruction
   leaves the state before or after. (Foxglove's stream reader, which accepts nothing after the last record, sees the
   moment at which the end moves. At a power failure the disk may reorder pages: ``sync`` bounds the loss.)
-- Messages stay in order of arrival; sorting by log time would hold back messages that a killed recording should
-  contain.
+- Messages stay in order of arrival: sorting by log time would delay messages that a killed recording should contain.
 """
 
 from __future__ import annotations
@@ -50,8 +49,6 @@ _HEAD = rec.RECORD_HEAD_SIZE
 
 @dataclass(slots=True)
 class _Slot:
-    """One of the two places for a summary, and which parts of the summary it holds."""
-
     start: int
     capacity: int
     described: int = -1
@@ -227,7 +224,6 @@ class McapLayout:
         return [_Slot(top - 2 * capacity, capacity), _Slot(top - capacity, capacity)]
 
     def _blob(self, parts: Sequence[bytes], start: int, size: int) -> tuple[bytes, int]:
-        """Return records for offset ``start``, followed by padding up to the tail, and where the padding begins."""
         end = start + size
         filler = b""
         if end % _PAGE > _PAGE - _HEAD:
@@ -238,7 +234,7 @@ class McapLayout:
         return b"".join([*parts, filler, rec.padding_head(end, self._tail)]), end
 
     def _begin_group(self) -> None:
-        """Choose the place of the next staged chunks; ensure room for the chunk that replaces them."""
+        """Choose the place of the next staged chunks, with space for the chunk that replaces them."""
         # Messages of 31 bytes and more have index entries of 16 and, one in each chunk, 15 bytes more.
         if self.settled_end + 2 * self.group_limit + self.group_limit // 64 + 2 * _PAGE > self._area.start:
             self._grow(0)

@@ -61,7 +61,6 @@ def message_type(name: str, type_hash: str = "") -> MessageType:
 
 
 def _register_from_ament(name: str) -> bool:
-    """Register a type and its dependencies from installed packages; False if a file is missing."""
     from rosbags.typesys import get_types_from_msg
 
     store = typestore()

@@ -158,7 +158,6 @@ class MetadataFile:
         self._seen = self._spare = -1
 
     def _take_turns(self, data: bytes) -> bool:
-        """Write the hidden file and exchange it with the visible one; False if that is not possible."""
         # If another program replaced the visible file, an exchange would bring its file back the next time.
         if not _is_at(self._seen, self.path):
             return False

@@ -30,12 +30,12 @@ _CHANNEL_SIZE = 35
 class SealedMcapFile:
     """Append messages to a new MCAP file; after ``seal`` every reader sees them. ``compression`` is None or "zstd".
 
-    Each seal adds a small chunk. After about a megabyte the small chunks are rewritten as one: the file ends up as if
-    written in one go, and neither the time of a seal nor the writer's memory grows with the recording.
+    Each seal adds a small chunk. After about a megabyte the small chunks are rewritten as one, so neither the time of a
+    seal nor the writer's memory grows with the recording.
 
     Raises:
         BagError: The file exists.
-        OSError: In all methods: the disk is full or fails; the file still shows what was sealed before.
+        OSError: In all methods: the disk is full or fails; the file still shows what was flushed before.
     """
 
     def __init__(self, path: Path, *, compression: str | None = None) -> None:
@@ -111,8 +111,7 @@ class SealedMcapFile:
     ) -> bool:
         """Add messages (topic, log time [ns], CDR) until the chunk has ``most`` bytes; return whether it is full.
 
-        Counts them in ``counts``; the rest stays in the iterator. Raises BagError at a topic without channel. The loop
-        avoids calls: Python's own steps take most of the time.
+        Counts them in ``counts``; the rest stays in the iterator. Raises BagError at a topic without channel.
         """
         pending, index, sequences = self._pending, self._pending_index, self._sequences
         pack, size, (start, stop) = rec.MESSAGE_HEADER.pack, self._pending_size, self._pending_span

@@ -2,8 +2,8 @@
 
 SQLite makes commits safe with a journal, which rosbag2 readers that open the file as immutable ignore: a killed writer
 leaves them an empty or torn database. Here full table pages are written once. The unfinished pages (last leaf and its
-ancestors) each have two places that take turns, so a commit never touches a visible page. Page 1, which names the roots
-and the file's size, is the commit; the kernel copies one page as a whole.
+ancestors) each have two alternating places, so a commit never touches a visible page. Page 1, which names the roots and
+the file's size, is the commit; the kernel copies one page as a whole.
 
 File format: https://www.sqlite.org/fileformat2.html (sections 1.3 header, 1.5 freelist, 1.6 b-tree pages, 2.1 records).
 """
@@ -126,7 +126,6 @@ class SealedSqliteFile:
             self._pending_size, self._pending_span = waiting, (start, stop)
 
     def _head(self, channel_id: int, size: int) -> bytes:
-        """Return the part of a message's row before its time."""
         # Columns: id (NULL, it is the row id), topic_id (32 bit), timestamp (64 bit), data (blob).
         types = b"\x00\x04\x06" + varint(2 * size + 12)
         head = bytes((len(types) + 1,)) + types + struct.pack(">i", channel_id)
@@ -198,7 +197,6 @@ class SealedSqliteFile:
             table.confirm()
 
     def _write_runs(self) -> None:
-        """Write the waiting pages, neighbours together; on failure they stay waiting."""
         waiting = self._pages.waiting
         run: list[bytes] = []
         start = 0
