@@ -20,7 +20,7 @@ from pendulum_msgs_py.programs import realtime
 from pendulum_msgs_py.programs.realtime import (
     as_ordinary,
     may_run_in_real_time,
-    priority_kept,
+    preserved_priority,
     run_ahead,
     run_in_real_time,
 )
@@ -204,7 +204,7 @@ def test_a_system_without_such_priorities_says_so_and_does_without(monkeypatch: 
     assert not may_run_in_real_time(50)
     with pytest.raises(ParameterError, match="realtime_priority is 50; this system has none: expected 0"):
         run_in_real_time(50)
-    with as_ordinary(), priority_kept():
+    with as_ordinary(), preserved_priority():
         pass
 
 

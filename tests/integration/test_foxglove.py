@@ -141,7 +141,7 @@ def test_a_viewer_reads_sets_and_stops_a_plant_by_the_rules_of_all(
         failure = client.call("/sim/simulator/e_stop")["failure"]
     finally:
         simulator.send_signal(signal.SIGCONT)
-    assert "/sim/simulator/e_stop does not answer within 3 s" in failure
+    assert "/sim/simulator/e_stop does not respond within 3 s" in failure
     simulator.interrupt()
     assert simulator.wait(20) == 0
     wait_for(lambda: "/sim/joint_states" not in client.ask("seen")["topics"], 30, "the plant to be gone")

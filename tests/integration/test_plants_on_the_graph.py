@@ -111,7 +111,7 @@ def test_a_plant_that_is_armed_or_commanded_or_not_there_is_left_alone(
 
     commanded = experiment(processes, domain_id, out, *lab, "--yes")
     assert commanded.wait(60.0) == 2
-    assert "/lab/effort_command has 1 publisher: somebody else commands this plant" in commanded.output
+    assert "/lab/effort_command has 1 publisher: another program commands this plant" in commanded.output
 
     peer.leave_the_command()
     assert peer.arm().success
@@ -139,5 +139,7 @@ def test_a_commander_who_is_met_later_than_the_plant_is_noticed(
             return count(topic) if asked.count(topic) > 1 else 0
 
         monkeypatch.setattr(orchestrator.node, "count_publishers", late)
-        with pytest.raises(FaultError, match="/lab/effort_command has 1 publisher: somebody else commands this plant"):
+        with pytest.raises(
+            FaultError, match="/lab/effort_command has 1 publisher: another program commands this plant"
+        ):
             join(orchestrator, "/lab")

@@ -81,13 +81,13 @@ def test_interrupted_analysis_goes_on_and_a_changed_bag_is_asked_again(runs: Pat
     with pytest.raises(KeyboardInterrupt):
         analyse_bags(tmp_path / "out", pieces, ["metrics"], on_progress=stop)
     first = analyse_bags(tmp_path / "out", pieces, ["metrics"])
-    assert first.kept == 2
+    assert first.cached == 2
     again = analyse_bags(tmp_path / "out", pieces, ["metrics"])
-    assert (again.kept, again.bags) == (5, first.bags)
+    assert (again.cached, again.bags) == (5, first.bags)
     shutil.rmtree(runs / "wednesday")
     shutil.copytree(EXAMPLES / "regulation_sim", runs / "wednesday")
     mended = analyse_bags(tmp_path / "out", find_pieces([runs], ["metrics"]), ["metrics"])
-    assert (mended.kept, mended.failed) == (4, 0)
+    assert (mended.cached, mended.failed) == (4, 0)
 
 
 def test_bags_of_one_name_have_rows_of_their_own(runs: Path, tmp_path: Path) -> None:
@@ -151,9 +151,9 @@ def test_a_bag_whose_files_are_gone_and_a_program_that_stumbles_have_rows_that_s
 def test_another_version_of_the_program_asks_again(runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pieces = find_pieces([runs / "monday"], ["timing"])
     analyse_bags(tmp_path / "out", pieces, ["timing"])
-    assert analyse_bags(tmp_path / "out", pieces, ["timing"]).kept == 2
+    assert analyse_bags(tmp_path / "out", pieces, ["timing"]).cached == 2
     monkeypatch.setattr(bag_table, "program_hash", lambda: "another")
-    assert analyse_bags(tmp_path / "out", pieces, ["timing"]).kept == 0
+    assert analyse_bags(tmp_path / "out", pieces, ["timing"]).cached == 0
 
 
 def test_answers_are_kept_by_all_packages_that_they_depend_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -73,7 +73,7 @@ def test_compare_lists_the_designs_that_were_certified_when_the_machine_was_meas
     assert "K=(400, 0.1) not certified for the" in found["answer"]["sentence"]
     # A no about the motion beside a certificate: each says what it is about.
     assert found["answer"]["sentence"].endswith(
-        "certified to be stable there, which tells nothing of how closely it moves as simulated."
+        "certified to be stable there, which does not show how closely it moves as simulated."
     )
 
 
@@ -147,7 +147,7 @@ def test_a_policy_that_is_a_gain_near_upright_is_certified_as_that_gain(machine:
         # Beyond 1 mrad it is at its limit: a switch, of which no linear certificate speaks.
         ((4e4, 40.0), {}, "is no linear law near upright|does not settle near upright"),
         ((1.0, 0.0), {}, "does not settle near upright"),
-        ((33.0, 1.0), {"period": 0.05}, "answers every 0.05 s, and the hardware was measured every 0.01 s"),
+        ((33.0, 1.0), {"period": 0.05}, "commands every 0.05 s, and the hardware was measured every 0.01 s"),
     ],
 )
 def test_a_policy_without_a_linear_law_is_unknown_and_never_certified(

@@ -229,7 +229,7 @@ def test_a_run_that_lost_many_states_is_distinguished_from_a_sound_one(folder: P
     plants = compare_folders([folder]).plants
     assert timing_warning(plants) == ""
     disturbed = {**plants, "sim": {**plants["sim"], "samples": 2384, "missed_deadlines": 116}}
-    assert "sim missed 116 of 2500 states (4.6 %); look for pauses, end other programs" in timing_warning(disturbed)
+    assert "sim missed 116 of 2500 states (4.6 %); check for pauses, end other programs" in timing_warning(disturbed)
     assert "busy" not in timing_warning(disturbed)
 
 

@@ -193,7 +193,7 @@ def test_a_study_asks_before_each_run_of_a_real_machine_and_goes_on_where_it_was
     record = read_record(folder, study.runs[0])
     assert record is not None
     assert "replay_file is empty" in record["reason"]
-    assert "settings cannot be kept" in record["reason"]
+    assert "settings cannot be saved" in record["reason"]
     assert read_record(folder, study.runs[1]) is None
 
 

@@ -228,7 +228,7 @@ def test_nobody_keeps_a_running_plant_in_step(tmp_path: Path, capsys: pytest.Cap
     ("arguments", "sentence"),
     [
         (["--hardware", "ros:/lab"], "plant /lab runs on a ROS domain; expected --domain N, or ROS_DOMAIN_ID"),
-        (["--simulation", "ros:/lab", "--domain", "3"], "ros:/lab does not tell its equation; expected --plant FILE"),
+        (["--simulation", "ros:/lab", "--domain", "3"], "ros:/lab does not state its equation; expected --plant FILE"),
     ],
 )
 def test_a_running_plant_needs_its_domain_and_a_simulation_its_equation(

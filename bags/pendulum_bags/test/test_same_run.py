@@ -112,7 +112,7 @@ def test_a_delay_beyond_all_that_is_looked_at_is_not_reported_as_the_last_of_it(
     tests = {test.quantity: test for test in paired_tests([(slow, replace(slow, t=t + late))], Margins.parse())}
     assert tests["delay"].outcome is Outcome.UNDECIDED
     assert (tests["delay"].interval.low, tests["delay"].interval.high) == (-100.0, 100.0)
-    assert tests["delay"].sentence() == "delay: the motions are too little alike to tell it"
+    assert tests["delay"].sentence() == "delay: the motions are too dissimilar to measure it"
     # Nothing was taken out of the distances.
     assert not [name for name in tests if "less the delay" in name]
 
@@ -251,7 +251,7 @@ def test_a_tone_above_the_slower_plants_reach_is_not_folded_into_its_band() -> N
 def test_the_layer_says_what_differs_and_what_to_do() -> None:
     late = same_run_layer(compare([pair(5, late=0.01)]))
     assert late.mark is Mark.NO
-    assert late.reason.startswith("the hardware answers 10")
+    assert late.reason.startswith("the hardware responds 10")
     assert late.reason.split(";")[0].endswith("ms later than the simulation (5 ms allowed)")
     assert late.next_steps[0].startswith("Give the simulated plant 10")
     assert "ms more delay than now: transport_delay in its plant file" in late.next_steps[0]

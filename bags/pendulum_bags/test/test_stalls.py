@@ -39,7 +39,7 @@ def failing(folder: Path, errors: list[FaultError | None]) -> Callable[[], None]
 
 def test_a_stalled_run_is_reported_and_carried_out_again_in_a_clean_folder(tmp_path: Path) -> None:
     said: list[str] = []
-    run_undisturbed(failing(tmp_path, [STALL, None]), tmp_path, emulated=True, tell=said.append)
+    run_undisturbed(failing(tmp_path, [STALL, None]), tmp_path, emulated=True, report=said.append)
     assert said == [f"This machine stood still ({STALL}); measuring again, run 2 of at most 3."]
     left = ["hw", "logs", "logs_stalled_1", "repeats", "sim", "sim_500hz", "stalls.json"]
     assert sorted(place.name for place in tmp_path.iterdir()) == left
@@ -51,7 +51,7 @@ def test_a_machine_that_stalls_each_time_is_an_error_after_three_runs(tmp_path: 
     with pytest.raises(
         FaultError, match=r"stood still in each of 3 runs, .*host_stalled.*; close what else runs on it"
     ):
-        run_undisturbed(failing(tmp_path, errors), tmp_path, emulated=True, tell=lambda _: None)
+        run_undisturbed(failing(tmp_path, errors), tmp_path, emulated=True, report=lambda _: None)
     assert len(errors) == 1
     assert [stall["logs"] for stall in read_stalls(tmp_path)] == ["logs_stalled_1", "logs_stalled_2", "logs"]
 
@@ -69,7 +69,7 @@ def test_what_a_stalled_run_left_outlives_an_end_of_the_next_one_that_records_no
         first()
 
     with pytest.raises(type(error)):
-        run_undisturbed(run, folder, emulated=True, tell=lambda _: None)
+        run_undisturbed(run, folder, emulated=True, report=lambda _: None)
     assert not discard_if_empty(folder)
     assert (folder / "logs_stalled_1" / "hw_bridge.log").read_text(encoding="utf-8") == "host_stalled"
     assert discard_if_empty(create_run_folder(tmp_path / "other", "thesis"))
@@ -89,7 +89,7 @@ def test_runs_that_broke_off_are_reported_by_the_comparison_the_terminal_and_the
         write_run_folder(folder, ramps=False)
 
     folder.mkdir()
-    run_undisturbed(run, folder, emulated=True, tell=lambda _: None)
+    run_undisturbed(run, folder, emulated=True, report=lambda _: None)
     comparison = compare_folders([folder])
     settings, answer = RegulationSettings(), answer_of(comparison)
     found = Findings(Simulated("thesis", settings, folder, comparisons={"": comparison}))
@@ -99,7 +99,7 @@ def test_runs_that_broke_off_are_reported_by_the_comparison_the_terminal_and_the
     page = write_report(folder, summary, comparison=comparison, recordings=[], formats=[]).read_text(encoding="utf-8")
     for told in (capsys.readouterr().out, page):
         words = " ".join(told.split())
-        assert "1 run broke off before this one and does not count" in words
+        assert "1 run aborted before this one and does not count" in words
         assert reason in words
 
 
@@ -117,7 +117,7 @@ def test_what_is_no_stall_of_an_emulator_ends_the_experiment_at_once(
     tmp_path: Path, error: FaultError, emulated: bool
 ) -> None:
     with pytest.raises(FaultError) as raised:
-        run_undisturbed(failing(tmp_path, [error, None]), tmp_path, emulated=emulated, tell=pytest.fail)
+        run_undisturbed(failing(tmp_path, [error, None]), tmp_path, emulated=emulated, report=pytest.fail)
     assert raised.value is error
 
 

@@ -99,7 +99,7 @@ def test_a_scheduler_that_is_not_there_is_one_sentence(monkeypatch: pytest.Monke
     pytest.importorskip("distributed")
     monkeypatch.setattr("pendulum_bags.studies.chunks._CONNECT_TIMEOUT", 0.2)
     with (
-        pytest.raises(FaultError, match=r"no Dask scheduler answers at 'tcp://127\.0\.0\.1:9'"),
+        pytest.raises(FaultError, match=r"no Dask scheduler responds at 'tcp://127\.0\.0\.1:9'"),
         cluster_client("tcp://127.0.0.1:9"),
     ):
         pass

@@ -93,8 +93,8 @@ def check_plant(truth: PlantParameters, found: PlantParameters) -> Judgement:
         return Judgement(True, f"every parameter is within its tolerance ({limits})")
     words = ", ".join(f"{name} ({getattr(found, name):.4g} {units[name]})" for name in off)
     good = [name for name in PLANT_TOLERANCES if name not in off]
-    kept = f"; within tolerance: {', '.join(good)}" if good else ""
-    return Judgement(False, f"outside of the tolerance: {words}{kept}; the tolerances are {limits}")
+    within = f"; within tolerance: {', '.join(good)}" if good else ""
+    return Judgement(False, f"outside of the tolerance: {words}{within}; the tolerances are {limits}")
 
 
 def check_delay(tasks: Tasks, delay: float) -> Judgement:
@@ -154,7 +154,7 @@ def check_fault(tasks: Tasks, bag: Path) -> Judgement:
         return Judgement(False, words)
     later = (since > _STOPPED_WITHIN) & (since < until)
     if not later.any() or float(since[later].max()) < _WATCHED:
-        return Judgement(False, f"the recording ends too early; let it go on for {_WATCHED:g} s after the fault")
+        return Judgement(False, f"the recording ends too early; let it run for {_WATCHED:g} s after the fault")
     untold = np.setdiff1d(states, applied["stamp_ns"])
     if lacking := _what_is_missing(since, (untold - int(modes[index]["stamp_ns"])) / NANOSECONDS, until):
         return Judgement(False, f"{lacking}; record all of {topic}, and leave nothing out")

@@ -25,9 +25,9 @@ FAULTS = {
 """Faults that the last exercise may require, with the emulator's fault that leads to each.  Frozen feedback is not
 among them: a bridge without measurements publishes no torque, so no recording shows it."""
 CAUSES = {
-    "power": "noise that is held longer has more power at low frequencies, and the loop answers to those alone",
+    "power": "noise that is held longer has more power at low frequencies, and the loop responds to those alone",
     "plant": "the machine is less damped than its model",
-    "late": "the controller answers later on the machine",
+    "late": "the controller responds later on the machine",
     "samples": "fewer samples in a second make the estimate of a standard deviation smaller",
 }
 """Explanations that the fourth exercise offers; the first is the right one."""

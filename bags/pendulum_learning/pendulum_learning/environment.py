@@ -232,10 +232,10 @@ class SwingUp:
             "samples": self._samples, "astray": self._astray,
         }  # fmt: skip
 
-    def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Resume from a checkpoint."""
         for name, array in self.state().items():
-            array[...] = kept[name]
+            array[...] = state[name]
 
     def _kick(self) -> None:
         draw, task = self._generator, self.task

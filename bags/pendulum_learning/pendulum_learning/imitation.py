@@ -98,11 +98,11 @@ class Imitation:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of a checkpoint."""
-        kept: dict[str, NDArray[Any]] = {f"actor_{k}": each for k, each in enumerate(self.actor.parameters)}
-        return kept | {f"adam_{key}": each for key, each in self._adam.state().items()}
+        state: dict[str, NDArray[Any]] = {f"actor_{k}": each for k, each in enumerate(self.actor.parameters)}
+        return state | {f"adam_{key}": each for key, each in self._adam.state().items()}
 
-    def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Resume from a checkpoint."""
         for k, each in enumerate(self.actor.parameters):
-            each[...] = kept[f"actor_{k}"]
-        self._adam.restore({key.removeprefix("adam_"): each for key, each in kept.items() if key.startswith("adam_")})
+            each[...] = state[f"actor_{k}"]
+        self._adam.restore({key.removeprefix("adam_"): each for key, each in state.items() if key.startswith("adam_")})

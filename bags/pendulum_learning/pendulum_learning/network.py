@@ -25,7 +25,7 @@ class Mlp:
             self.parameters.append((scale * generator.standard_normal((before, after))).astype(np.float32))
             self.parameters.append(np.zeros(after, dtype=np.float32))
         self._inputs: list[Floats] = []
-        self._kept: dict[tuple[str, int, int], Floats] = {}
+        self._buffers: dict[tuple[str, int, int], Floats] = {}
 
     def forward(self, x: Floats) -> Floats:
         """Return outputs (n, out) for inputs (n, in), and store what :meth:`backward` needs."""
@@ -56,9 +56,9 @@ class Mlp:
     def _room(self, what: str, layer: int, like: Floats, width: int) -> Floats:
         """Return a reused array of ``like``'s rows and type: fresh memory costs more than the product that fills it."""
         key = (f"{what} {layer}", len(like), width)
-        if key not in self._kept or self._kept[key].dtype != like.dtype:
-            self._kept[key] = np.empty((len(like), width), dtype=like.dtype)
-        return self._kept[key]
+        if key not in self._buffers or self._buffers[key].dtype != like.dtype:
+            self._buffers[key] = np.empty((len(like), width), dtype=like.dtype)
+        return self._buffers[key]
 
 
 class Adam:
@@ -89,14 +89,14 @@ class Adam:
 
     def state(self) -> dict[str, NDArray[np.generic]]:
         """Return the arrays of a checkpoint."""
-        kept: dict[str, NDArray[np.generic]] = {"count": np.array(self.count)}
+        state: dict[str, NDArray[np.generic]] = {"count": np.array(self.count)}
         for k, (m, v) in enumerate(zip(self.first, self.second, strict=True)):
-            kept[f"first_{k}"], kept[f"second_{k}"] = m, v
-        return kept
+            state[f"first_{k}"], state[f"second_{k}"] = m, v
+        return state
 
-    def restore(self, kept: Mapping[str, NDArray[np.generic]]) -> None:
+    def restore(self, state: Mapping[str, NDArray[np.generic]]) -> None:
         """Resume from a checkpoint."""
-        self.count = int(kept["count"])
+        self.count = int(state["count"])
         for k in range(len(self.parameters)):
-            self.first[k][...] = kept[f"first_{k}"]
-            self.second[k][...] = kept[f"second_{k}"]
+            self.first[k][...] = state[f"first_{k}"]
+            self.second[k][...] = state[f"second_{k}"]

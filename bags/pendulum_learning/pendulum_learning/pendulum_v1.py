@@ -70,7 +70,7 @@ class PendulumV1:
         """Return the arrays of a checkpoint."""
         return {"angle": self.angle, "velocity": self.velocity, "left": self._left}
 
-    def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Resume from a checkpoint."""
-        self.angle, self.velocity = kept["angle"].copy(), kept["velocity"].copy()
-        self._left = kept["left"].copy()
+        self.angle, self.velocity = state["angle"].copy(), state["velocity"].copy()
+        self._left = state["left"].copy()

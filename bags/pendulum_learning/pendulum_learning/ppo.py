@@ -45,7 +45,7 @@ class BatchEnvironment(Protocol):
     def state(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of a checkpoint."""
 
-    def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Resume from a checkpoint."""
 
 
@@ -196,22 +196,22 @@ class Ppo:
 
     def state(self) -> dict[str, NDArray[Any]]:
         """Return the arrays of a checkpoint."""
-        kept: dict[str, NDArray[Any]] = {"rate": np.array(self.rate), "log_spread": self.log_spread}
+        state: dict[str, NDArray[Any]] = {"rate": np.array(self.rate), "log_spread": self.log_spread}
         for name, network in (("actor", self.actor), ("critic", self.critic)):
-            kept |= {f"{name}_{k}": each for k, each in enumerate(network.parameters)}
+            state |= {f"{name}_{k}": each for k, each in enumerate(network.parameters)}
         for name, adam in (("adam_actor", self._adam_actor), ("adam_critic", self._adam_critic)):
-            kept |= {f"{name}_{key}": each for key, each in adam.state().items()}
-        return kept
+            state |= {f"{name}_{key}": each for key, each in adam.state().items()}
+        return state
 
-    def restore(self, kept: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, state: Mapping[str, NDArray[Any]]) -> None:
         """Resume from a checkpoint."""
-        self.rate = float(kept["rate"])
-        self.log_spread[...] = kept["log_spread"]
+        self.rate = float(state["rate"])
+        self.log_spread[...] = state["log_spread"]
         for name, network in (("actor", self.actor), ("critic", self.critic)):
             for k, each in enumerate(network.parameters):
-                each[...] = kept[f"{name}_{k}"]
+                each[...] = state[f"{name}_{k}"]
         for name, adam in (("adam_actor_", self._adam_actor), ("adam_critic_", self._adam_critic)):
-            adam.restore({key.removeprefix(name): each for key, each in kept.items() if key.startswith(name)})
+            adam.restore({key.removeprefix(name): each for key, each in state.items() if key.startswith(name)})
 
 
 def finite_or_diverged(parameters: Iterable[Floats]) -> None:

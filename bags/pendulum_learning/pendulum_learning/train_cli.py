@@ -56,19 +56,19 @@ def train(
     updates: Annotated[int, typer.Option(help="Updates of the policy; 0 for as many as the task takes.", min=0)] = 0,
     share: Annotated[float, typer.Option(help="Half width of the range of each parameter, as a share.")] = 0.25,
     delay: Annotated[float, typer.Option(help="Longest mean delay from state to torque [s].")] = 0.008,
-    jitter: Annotated[float, typer.Option(help="Standard deviation of the delay from answer to answer [s].")] = 0.001,
+    jitter: Annotated[float, typer.Option(help="Standard deviation of the delay from command to command [s].")] = 0.001,
     angle_noise: Annotated[float, typer.Option(help="Standard deviation of measured angles [rad].")] = 1e-3,
     velocity_noise: Annotated[float, typer.Option(help="Standard deviation of measured velocities [rad/s].")] = 0.03,
     kick: Annotated[float, typer.Option(help="Largest kick, as a share of the torque limit.")] = 0.7,
-    period: Annotated[float, typer.Option(help="Time between two answers [s].")] = 0.01,
+    period: Annotated[float, typer.Option(help="Time between two commands [s].")] = 0.01,
     history: Annotated[int, typer.Option(help="Samples that the policy sees.")] = 3,
     travel: Annotated[float, typer.Option(help="Largest deviation of a joint that slides [m].")] = 0.4,
     hidden: Annotated[tuple[int, int], typer.Option(help="Widths of the hidden layers.")] = (64, 64),
     json_output: Json = False,
 ) -> None:
-    """Train a policy for a plant: on plants, delays, noise and kicks drawn anew for each episode.
+    """Train a policy for a plant: on plants, delays, noise and kicks drawn again for each episode.
 
-    An interrupted training goes on with the same command; its checkpoint lies beside the policy file.
+    An interrupted training resumes with the same command; its checkpoint is next to the policy file.
 
     With --teacher tvlqr the defaults are others: period 0.004, delay 0.0016, jitter 0.0004, share 0.05, kick 0.05,
     angle noise 0.0002, velocity noise 0.005. Its policy knows the way up from hanging, and no other.
@@ -103,7 +103,7 @@ def train(
     console = make_console(stderr=json_output, highlight=False)
     began = time.monotonic()
     try:
-        with counting_bar(console, TextColumn("{task.fields[told]}"), TimeRemainingColumn()) as bar:
+        with counting_bar(console, TextColumn("{task.fields[status]}"), TimeRemainingColumn()) as bar:
             shown = bar.add_task("updates", total=settings.updates, status="compiling")
 
             def on_update(done: int, measured: Mapping[str, float]) -> None:
@@ -114,8 +114,8 @@ def train(
 
             policy, curves = train_policy(settings, out, on_update=on_update, on_trial=on_trial)
     except KeyboardInterrupt:
-        kept = checkpoint_path(out)
-        there = f"the same command goes on from {kept}" if kept.exists() else "nothing was written"
+        checkpoint = checkpoint_path(out)
+        there = f"the same command resumes from {checkpoint}" if checkpoint.exists() else "nothing was written"
         console.print(f"interrupted: {there}", soft_wrap=True)
         raise typer.Exit(EXIT_INTERRUPTED) from None
     figure = _write_curves(out, settings, curves)

@@ -234,17 +234,17 @@ def _keep(
 
 
 def _check_arrays(
-    path: Path, kept: Mapping[str, NDArray[Any]], learner: Ppo | Imitation, joints: int, updates: int
+    path: Path, stored: Mapping[str, NDArray[Any]], learner: Ppo | Imitation, joints: int, updates: int
 ) -> None:
     """Refuse arrays that do not match the settings: numpy would broadcast or cast them silently."""
     expected = {f"learner/{name}": np.asarray(each) for name, each in learner.state().items()}
     expected |= {f"environment/{name}": each for name, each in learner.environment.state().items()}
     for name in (*expected, "curves", "fastest"):
-        if name not in kept:
+        if name not in stored:
             raise DataError(f"checkpoint {path} lacks {name}; expected a whole one, another --out, or it removed")
-    expected |= {"fastest": np.zeros(joints), "curves": np.zeros((len(kept["curves"]), 4))}
+    expected |= {"fastest": np.zeros(joints), "curves": np.zeros((len(stored["curves"]), 4))}
     for name, own in expected.items():
-        found = kept[name]
+        found = stored[name]
         if found.shape != own.shape or found.dtype != own.dtype:
             problem = (
                 f"has shape {found.shape} of {found.dtype}; expected {own.shape} of {own.dtype}, as the settings say"
@@ -254,10 +254,10 @@ def _check_arrays(
         else:
             continue
         raise DataError(f"checkpoint {path}: {name} {problem}: another --out, or the checkpoint removed")
-    if not 1 <= len(kept["curves"]) <= updates:
+    if not 1 <= len(stored["curves"]) <= updates:
         raise DataError(
-            f"checkpoint {path} has done {len(kept['curves'])} updates; expected 1 to {updates}: another --out, or the "
-            "checkpoint removed"
+            f"checkpoint {path} has done {len(stored['curves'])} updates; expected 1 to {updates}: another --out, or "
+            "the checkpoint removed"
         )
 
 
@@ -267,19 +267,21 @@ def _restore(
     try:
         if path.stat().st_size > _LARGEST_CHECKPOINT:
             raise DataError(f"checkpoint {path} has more than {_LARGEST_CHECKPOINT} bytes; expected one of ours")
-        with np.load(path, allow_pickle=False) as kept:
-            if kept["settings"].tobytes().decode() != _settings_text(settings):
+        with np.load(path, allow_pickle=False) as stored:
+            if stored["settings"].tobytes().decode() != _settings_text(settings):
                 raise ParameterError(
                     f"checkpoint {path} is of a training with other settings; expected the same ones, another --out, "
                     "or the checkpoint removed"
                 )
             joints = len(settings.plant.coordinates.joints)
-            _check_arrays(path, kept, learner, joints, settings.updates)
-            learner.restore({key[8:]: kept[key] for key in kept.files if key.startswith("learner/")})
-            learner.environment.restore({key[12:]: kept[key] for key in kept.files if key.startswith("environment/")})
-            generator.bit_generator.state = json.loads(kept["generator"].tobytes().decode())
-            curves: list[list[float]] = kept["curves"].tolist()
-            return curves, kept["fastest"]
+            _check_arrays(path, stored, learner, joints, settings.updates)
+            learner.restore({key[8:]: stored[key] for key in stored.files if key.startswith("learner/")})
+            learner.environment.restore(
+                {key[12:]: stored[key] for key in stored.files if key.startswith("environment/")}
+            )
+            generator.bit_generator.state = json.loads(stored["generator"].tobytes().decode())
+            curves: list[list[float]] = stored["curves"].tolist()
+            return curves, stored["fastest"]
     except (ParameterError, DataError):
         raise
     except Exception as error:

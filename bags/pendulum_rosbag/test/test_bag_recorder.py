@@ -228,7 +228,7 @@ def test_a_topic_that_nobody_publishes_is_named_and_fails(
     wait_until_received(node, there=1)
     recording.interrupt()
     assert recording.wait(30.0) == 1
-    assert "NOT recorded: /typo (nobody published it)" in recording.output
+    assert "NOT recorded: /typo (it had no publisher)" in recording.output
     assert "nothing lost" not in recording.output
     assert len(read_bag(tmp_path / "run")["/there"]) == 1
 

@@ -226,14 +226,14 @@ def test_a_topic_that_appears_while_the_disk_fails_ends_no_recorder(
 def test_what_was_asked_for_and_never_came_is_named() -> None:
     some = RecorderOptions(Path("bag"), ("/a", "/b", "/left"), "^/sim/", "left")
     assert some.unmet(["/a", "/sim/x"]) == {
-        "/b": "nobody published it",
+        "/b": "it had no publisher",
         "/left": "it is left out by the pattern of exclude",
     }
     assert some.unmet(["/a", "/b"]) == {
         "/left": "it is left out by the pattern of exclude",
-        "topics that match '^/sim/'": "nobody published any",
+        "topics that match '^/sim/'": "they had no publisher",
     }
-    assert RecorderOptions(Path("bag")).unmet([]) == {"any topic": "nobody published one"}
+    assert RecorderOptions(Path("bag")).unmet([]) == {"any topic": "none had a publisher"}
     assert not RecorderOptions(Path("bag")).unmet(["/a"])
 
 

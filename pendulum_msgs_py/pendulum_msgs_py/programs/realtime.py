@@ -18,7 +18,7 @@ __all__ = [
     "NO_REALTIME",
     "as_ordinary",
     "may_run_in_real_time",
-    "priority_kept",
+    "preserved_priority",
     "run_ahead",
     "run_in_real_time",
     "thread_numbers",
@@ -95,14 +95,14 @@ def as_ordinary() -> Iterator[None]:
     A thread that computes in real time for a second blocks its core, and the kernel's 50 ms break then delays a plant
     there.
     """
-    with priority_kept():
+    with preserved_priority():
         if _is_known() and os.sched_getparam(0).sched_priority:
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         yield
 
 
 @contextlib.contextmanager
-def priority_kept() -> Iterator[None]:
+def preserved_priority() -> Iterator[None]:
     """Restore this thread's scheduling on exit."""
     if not _is_known():
         yield

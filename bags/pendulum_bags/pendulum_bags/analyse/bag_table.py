@@ -88,7 +88,7 @@ class Table:
 
     bags: Sequence[Row]
     runs: Sequence[Row]
-    kept: int = 0
+    cached: int = 0
     wall: float = field(default=0.0, compare=False)
 
     @property
@@ -164,9 +164,9 @@ def analyse_bags(
     answers.mkdir(parents=True, exist_ok=True)
     # The key of a result covers bag and questions, so that a changed bag is analysed again.
     keys = [piece.fingerprint(questions) for piece in pieces]
-    rows = {index: found for index, key in enumerate(keys) if (found := _kept(answers / f"{key}.json")) is not None}
-    kept = len(rows)
-    on_progress(kept, len(pieces))
+    rows = {index: found for index, key in enumerate(keys) if (found := _cached(answers / f"{key}.json")) is not None}
+    cached = len(rows)
+    on_progress(cached, len(pieces))
     job = (tuple(pieces), tuple(questions), str(folder.resolve()))
     missing = [index for index in range(len(pieces)) if index not in rows]
     for index, found in carry_out(_ask, job, missing, connect):
@@ -176,7 +176,7 @@ def analyse_bags(
     table = Table(
         bags=[row for index, piece in enumerate(pieces) if not piece.is_run for row in rows[index]],
         runs=[row for index, piece in enumerate(pieces) if piece.is_run for row in rows[index]],
-        kept=kept,
+        cached=cached,
         wall=time.monotonic() - began,
     )
     for name, content in (("bags", table.bags), ("runs", table.runs)):
@@ -259,7 +259,7 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _kept(path: Path) -> list[Row] | None:
+def _cached(path: Path) -> list[Row] | None:
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):

@@ -56,7 +56,7 @@ def analyse(
         str,
         typer.Option(help=f"Questions: {_named(of_runs=False)} of each plant; {_named(of_runs=True)} of run folders."),
     ] = "metrics,timing",
-    out: Annotated[Path, out_option("Folder for the tables; an interrupted analysis goes on there.")] = Path(
+    out: Annotated[Path, out_option("Folder for the tables; an interrupted analysis resumes there.")] = Path(
         "bags", "runs", "analysed"
     ),
     workers: Annotated[
@@ -109,8 +109,8 @@ def _print(console: Console, found: BagTable, out: Path, elapsed: float) -> None
             if row["error"]:
                 console.print(f"{row['bag']} {row['plant']}: {row['error']}", markup=False)
         console.print(f"table   {out / file}.csv, with all columns")
-    kept = f", {found.kept} of them answered before" if found.kept else ""
-    console.print(f"({len(found.bags) + len(found.runs)} rows{kept}, {elapsed:.0f} s)")
+    cached = f", {found.cached} of them cached" if found.cached else ""
+    console.print(f"({len(found.bags) + len(found.runs)} rows{cached}, {elapsed:.0f} s)")
 
 
 def _cell(value: Any) -> str:

@@ -150,7 +150,7 @@ def compare(
                 f"got {len(paths)} paths ({', '.join(map(str, paths))}); "
                 "expected recordings of a simulation and of hardware, or run folders that hold sim and hw"
             )
-        kept = [*(paths if len(paths) == 1 else ()), *(layers or ())]
+        sources = [*(paths if len(paths) == 1 else ()), *(layers or ())]
         if joints or joint:
             if machine or design:
                 raise DataError("--machine and --design are of plants of one joint; expected neither for several")
@@ -160,7 +160,7 @@ def compare(
             results = {name: run(joint=name) for name in ([joint] if joint else joints)}
         else:
             results = {"": run()}
-        answer, content, certified = _judge(results, kept, machine, design or ())
+        answer, content, certified = _judge(results, sources, machine, design or ())
     run_folder = paths[0] if len(paths) == 1 else paths[0].parent
     of_run = len(paths) == 1 or [*paths] == [run_folder / "sim", run_folder / "hw"]
     margins_file = margins.keep(run_folder) if margins.stated and of_run else None
@@ -180,21 +180,21 @@ def compare(
     if margins_file:
         print(f"margins {margins_file} (report uses them)")
     if out is not None:
-        print(f"\nwritten: {out / 'comparison.json'} and figures beside it")
+        print(f"\nwritten: {out / 'comparison.json'} and figures next to it")
 
 
 def _judge(
-    results: Mapping[str, Comparison], kept: Sequence[Path], machine: Path | None, designs: Sequence[str]
+    results: Mapping[str, Comparison], sources: Sequence[Path], machine: Path | None, designs: Sequence[str]
 ) -> tuple[Answer, dict[str, Any], Sequence[DesignResult]]:
     from pendulum_bags.frequency_response.carry_over import carry_over, layers_of
     from pendulum_bags.verdict.answer import answer_of
 
     if "" not in results:
-        answer = answer_of(results, kept)
+        answer = answer_of(results, sources)
         joints = {joint: result.to_json() for joint, result in results.items()}
         return answer, {"joints": joints, "answer": answer.to_json()}, ()
-    certified = carry_over(results[""], kept, machine, designs)
-    answer = answer_of(results[""], kept, updated=layers_of(certified))
+    certified = carry_over(results[""], sources, machine, designs)
+    answer = answer_of(results[""], sources, updated=layers_of(certified))
     content = {**results[""].to_json(), "answer": answer.to_json()}
     if certified is None:
         return answer, content, ()
@@ -255,11 +255,11 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
     elif result.is_paired:
         pair = result.pairs[0]
         delay = result.delay * 1e3
-        answers = f"answers {abs(delay):.2f} ms {'later' if delay >= 0 else 'earlier'} than the simulation"
+        answers = f"responds {abs(delay):.2f} ms {'later' if delay >= 0 else 'earlier'} than the simulation"
         console.print(
             f"Alignment: the disturbances agree at {pair.clock.delay * 1e3:.2f} ms"  # type: ignore[union-attr]
             f" (correlation {pair.clock.correlation:.3f}); "  # type: ignore[union-attr]
-            f"{result.hardware_name} {answers if math.isfinite(delay) else 'shows no delay that could be told'}."
+            f"{result.hardware_name} {answers if math.isfinite(delay) else 'shows no measurable delay'}."
         )
     else:
         console.print(f"Not paired: {content['paired']['reason']}.")

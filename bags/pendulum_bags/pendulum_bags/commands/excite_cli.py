@@ -89,7 +89,7 @@ def excite(
             f"max_effort is {max_effort:g} N m; expected at most {prior.effort_limit:g} N m, the plant's limit"
         )
     if simulate and (not play or on != "sim"):
-        raise DataError("simulate names a plant; expected it beside --play and --on sim, which simulates one")
+        raise DataError("simulate names a plant; expected it with --play and --on sim, which simulates one")
     design.write(out)
     if as_json:
         content = {

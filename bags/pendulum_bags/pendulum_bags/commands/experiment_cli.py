@@ -141,8 +141,8 @@ def thesis(
 ) -> None:
     """Regulate the upright pendulum under noise on simulator and hardware: is the simulation good enough?
 
-    On the emulator it goes on with new noise until the first layer is yes or no, identifies a plant where that is no,
-    and measures the other layers of both plants, until the budget is spent. Ctrl-C ends it with the answer so far.
+    On the emulator it repeats the run with new noise until the first layer is yes or no, identifies a plant if that is
+    no, and measures the other layers of both plants, until the budget is spent. Ctrl-C ends it with the answer so far.
     With a plant of several joints, such as acrobot, it is the experiment joints.
 
     Example: python -m pendulum_bags experiment thesis --out /tmp/my_run --seed 7 --margin delay=8ms
@@ -287,7 +287,7 @@ app.command(name="joints")(joints)
 def examples(
     out: Annotated[Path, out_option("Folder for the recordings.")] = Path("bags", "examples"),
 ) -> None:
-    """Record anew the small recordings that come with the project, in lockstep.
+    """Record the project's small recordings again, in lockstep.
 
     Example: python -m pendulum_bags experiment examples --out bags/examples
     """
@@ -313,7 +313,7 @@ def _running(settings: RegulationSettings, domain: int | None, plant: str | None
         raise ParameterError(f"plant {found[0]} runs on a ROS domain; expected --domain N, or ROS_DOMAIN_ID")
     if settings.running("sim") is not None and plant is None:
         raise ParameterError(
-            f"simulation {settings.simulation} does not tell its equation; expected --plant FILE, on which the "
+            f"simulation {settings.simulation} does not state its equation; expected --plant FILE, on which the "
             "controller is designed"
         )
     return found

@@ -84,7 +84,7 @@ def frequency_response(
 ) -> None:
     """Measure a plant's frequency response under feedback, and say which designs are safe to carry over to it.
 
-    Any recording with a known, rich disturbance or reference serves; a multisine tells most. Example:
+    Any recording with a known, rich disturbance or reference serves; a multisine is the most informative. Example:
 
         python -m pendulum_bags frequency_response bags/runs/today --design "q=100,0.01 r=0.1" --design pid
     """

@@ -78,7 +78,9 @@ def identify(
     held_out: Annotated[
         list[Path] | None, typer.Option(help="Recordings to score only; may be given more than once.")
     ] = None,
-    out: Annotated[Path | None, out_option("Plant file to write (*.yaml), with a .json and figures beside it.")] = None,
+    out: Annotated[
+        Path | None, out_option("Plant file to write (*.yaml), with a .json and figures next to it.")
+    ] = None,
     name: Annotated[str, typer.Option(help="Name of the plant in that file.")] = "identified",
     effort_limit: Annotated[float, typer.Option(help="Largest torque of the actuator [N m].")] = 13.0,
     plant: Annotated[
@@ -273,9 +275,9 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
     _print_sentences(console, result.sentences())
     if out is not None:
         console.print(f"wrote {out}", highlight=False)
-        told, command = result.next_step(str(out))
+        sentence, command = result.next_step(str(out))
         # The command is on a line of its own, to be copied.
-        console.print(f"{told}\n  {as_typed(command)}", markup=False, highlight=False, soft_wrap=True)
+        console.print(f"{sentence}\n  {as_typed(command)}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _print_sentences(console: Console, sentences: Sequence[str]) -> None:

@@ -94,7 +94,7 @@ def joints(
 
     The bridge drives the emulated hardware: quasi-direct drives, encoders and delays on a plant that is a little off.
     One controller, designed on the simulated plant, holds both, in lockstep; there the dry friction of a passive joint
-    counts as viscous: else acrobot and pendubot would fall. Then it goes on as the experiment thesis does: new noise
+    counts as viscous: else acrobot and pendubot would fall. Then it continues as the experiment thesis does: new noise
     until the first layer is decided, identification, and the other layers of both plants, until the budget is spent.
     Frequencies are measured where one joint is driven. A model file on either side has the joints of --plant, which
     is its equation, by name or in order. A plant that runs already is armed once it is held upright and still, balanced

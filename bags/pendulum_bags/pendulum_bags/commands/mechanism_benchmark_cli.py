@@ -45,7 +45,7 @@ def benchmark(
     """Score controllers of acrobot or pendubot by the public benchmark's protocol, to the letter.
 
     Swing-up from hanging in 10 s (score v2), six tests of robustness (v2), and time up under knock-downs (v3, of 2025).
-    Its published methods stand beside, as published: nothing of them was run here. A policy file is a controller, too;
+    The rows of published methods are quoted; those were not run here. A policy file is a controller, too;
     of FILE.npz+lqr an LQR takes over near upright.
 
     Example: python -m pendulum_bags experiment benchmark --plant pendubot --controller tvlqr --no-robustness

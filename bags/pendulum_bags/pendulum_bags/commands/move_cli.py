@@ -55,8 +55,8 @@ def move(
     which takes over from position control; at the end of `down` it disarms the plant; at an angle the plant holds.
     Ctrl-C disarms it. `stop` latches the plant's e-stop, and `reset` releases it without arming. `stop` needs the
     network and this computer: on a real machine use the motion stop first. Where the plant does not confirm it, the
-    exit code is 2. A request that reached a plant which stands still acts when it goes on; the plant itself is in
-    `fault` then, and arms only on request.
+    exit code is 2. A request that reached a suspended program acts when it continues; its plant is in `fault` then,
+    and arms only on request.
     """
     from pendulum_bags.experiments.domain import check_domain
     from pendulum_bags.experiments.graph_plant import find_plant

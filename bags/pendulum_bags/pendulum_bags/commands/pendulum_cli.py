@@ -51,7 +51,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "bridge": "pendulum_hw_bridge bridge",
         "export_model": "pendulum_sim export_model",
     },
-    "Who commands a plant": {
+    "Commanding a plant": {
         "controller": "pendulum_lqr controller",
         "disturbance": "pendulum_lqr disturbance",
         "effort_adapter": "pendulum_lqr effort_adapter",

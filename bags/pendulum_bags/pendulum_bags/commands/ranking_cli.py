@@ -34,7 +34,7 @@ def ranking(
     paths: Annotated[
         list[Path] | None,
         typer.Argument(
-            help="Studies, bags that say which controller ran on which side, folders as "
+            help="Studies, bags with the record of controller and side, folders as "
             "FOLDER/simulation/CONTROLLER/FILE and FOLDER/hardware/CONTROLLER/FILE, or tables (.csv, .yaml) with "
             "controller, side, and file, cost or score."
         ),

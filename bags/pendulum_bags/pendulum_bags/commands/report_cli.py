@@ -90,7 +90,7 @@ def report(
     folders = [folder for folder in folders if folder not in trials]
     if trials and not folders:
         raise BagError(
-            f"{trials[0]} holds trials and no run; expected a run folder beside it (identify --page shows trials alone)"
+            f"{trials[0]} holds trials and no run; expected a run folder next to it (identify --page shows trials)"
         )
     margins = Margins.of(margins_file, margin)
     if not margins.stated and len(folders) == 1:
@@ -114,7 +114,7 @@ def report(
         raise BagError(f"run folder {bad} has no bags sim and hw; expected run folders, or two bags")
     alone = folders[0] if pooled and len(folders) == 1 else None
     target = out or alone or folders[0].resolve().parent / "report"
-    kept = [*([alone] if alone else ()), *(layers or ())]
+    sources = [*([alone] if alone else ()), *(layers or ())]
     formats = ("png",) if png_only else ("png", "pdf")
 
     def extend(page: Page) -> Page:
@@ -136,7 +136,7 @@ def report(
                 margins = Margins.parse(margin_of(_of_joint(alone, joints[0])))
             run = partial(run, joints=names) if readings else run
             comparisons = {joint: run(margin=margins, joint=joint, open_bag=bags) for joint in joints}
-            answer = answer_of(comparisons, kept)
+            answer = answer_of(comparisons, sources)
             page = write_joint_report(
                 target, comparisons, folders=folders, formats=formats, answer=answer, extend=extend
             )
@@ -146,8 +146,8 @@ def report(
                 # What the run was judged by when it was recorded.
                 margins = Margins.parse(margin_of(summary))
             result = run(margin=margins, open_bag=bags)
-            certified = carry_over(result, kept, machine, design or ())
-            answer = answer_of(result, kept, updated=layers_of(certified))
+            certified = carry_over(result, sources, machine, design or ())
+            answer = answer_of(result, sources, updated=layers_of(certified))
             page = write_report(
                 target,
                 {key: value for key, value in (summary or {}).items() if key != "verdict"},
@@ -182,8 +182,8 @@ def _summary(folder: Path) -> dict[str, object] | None:
         content = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
-    kept = ("experiment", "seed", "strategy", "versions", "git_revision", "verdict")
-    return {key: content[key] for key in kept if key in content} if isinstance(content, dict) else None
+    shown = ("experiment", "seed", "strategy", "versions", "git_revision", "verdict")
+    return {key: content[key] for key in shown if key in content} if isinstance(content, dict) else None
 
 
 main = partial(cli_main, app, name="python -m pendulum_bags report")

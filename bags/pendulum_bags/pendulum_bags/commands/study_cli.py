@@ -34,7 +34,7 @@ __all__ = ["add_commands"]
 Out = Annotated[
     Path | None,
     out_option(
-        "Folder of the study; an interrupted study goes on there, and one that was given more seeds or plants "
+        "Folder of the study; an interrupted study resumes there, and one that was given more seeds or plants "
         "carries out those. Default: bags/runs/<name>."
     ),
 ]
@@ -247,11 +247,11 @@ def _study(
             console.print(f"run {record['number']} failed: {record['reason']}", markup=False)
     if end.failed == end.total:
         raise FaultError(f"all {end.total} runs failed; {folder}/runs holds their logs")
-    result, tell = _analyse(folder, found, records)
+    result, print_results = _analyse(folder, found, records)
     if json_output:
         print(json_text(result))
     else:
-        tell(console)
+        print_results(console)
         if found.analysis == "ranking":
             console.print(f"page    {folder / 'ranking.html'}", soft_wrap=True)
         wall = sum(record["wall_s"] for record in records)
@@ -274,18 +274,18 @@ def _analyse(
     from pendulum_bags.studies.results import group_runs, groups_to_json
 
     result: dict[str, Any] = {"study": found.name, "runs": len(records), "left_out": list(found.left_out)}
-    tell: Callable[[Console, Any], None]
+    print_results: Callable[[Console, Any], None]
     if found.experiment == "run":
-        key, tell = "groups", _print_groups
+        key, print_results = "groups", _print_groups
         result[key] = groups_to_json(group_runs(records))
     else:
-        key, tell = "pooled", pooled.print_table
+        key, print_results = "pooled", pooled.print_table
         result[key] = pooled.analyse(folder, found, records)
     if found.analysis == "strategies":
-        key, tell = "strategies", strategies.print_table
+        key, print_results = "strategies", strategies.print_table
         result[key] = strategies.analyse(folder, found)
     elif found.analysis == "pid_vs_lqr":
-        key, tell = "pid_vs_lqr", pid_vs_lqr.print_table
+        key, print_results = "pid_vs_lqr", pid_vs_lqr.print_table
         result[key] = pid_vs_lqr.analyse(folder, found, records)
     elif found.analysis == "ranking":
         from pendulum_bags.ranking.collect import collect_contenders
@@ -296,10 +296,10 @@ def _analyse(
         ranked = rank(contenders)
         notes = [f"Left out: {sentence}." for sentence in found.left_out]
         write_ranking(folder, ranked, notes=notes, emulated=all(one.emulated for one in contenders), case=case)
-        key, tell = "ranking", lambda console, _: print_ranking(console, ranked)
+        key, print_results = "ranking", lambda console, _: print_ranking(console, ranked)
         result[key] = ranked.to_json()
     write_json(folder / "results.json", result)
-    return result, lambda console: tell(console, result[key])
+    return result, lambda console: print_results(console, result[key])
 
 
 def _print_matrix(console: Console, found: Study, workers: int) -> None:

@@ -53,7 +53,7 @@ def inertia_damping(
 ) -> None:
     """Turn the flat pendulum by hand at zero PWM, six times, and regress effort on velocity and acceleration.
 
-    With --hardware hebi, a person turns it, told when by this terminal; on the emulator a simulated hand does.
+    With --hardware hebi, a person turns it, prompted by this terminal; on the emulator a simulated hand does.
 
     Example: python -m pendulum_bags experiment inertia_damping --out /tmp/hand
     """

@@ -256,7 +256,7 @@ def compare(
         tests = paired_tests(motions, margins, noises=shared, looks=looks, runs_differ=differ)
         verdict = conclude(tests, margins, *names)
     elif unlike := unlike or next((pair.unlike_noise for pair in compared if pair.unlike_noise), ""):
-        sentence = f"Undecided: {unlike}, so that the motions say nothing of the plants."
+        sentence = f"Undecided: {unlike}, so the plants cannot be compared."
         verdict = Verdict(Outcome.UNDECIDED, sentence, unpaired.tests, margins, None)
     thesis = interpolated_difference(simulations[0].window, compared[0].hardware.window)
     return Comparison(compared, simulations, thesis, verdict, unpaired, tested, looks)
@@ -351,7 +351,7 @@ def _in_words(stalls: Sequence[Mapping[str, str]]) -> str:
     reasons = "; ".join(stall["reason"] + (f" (logs: {stall['logs']})" if stall["logs"] else "") for stall in stalls)
     runs, does, what = ("run", "does", "a standstill") if len(stalls) == 1 else ("runs", "do", "standstills")
     return (
-        f"{len(stalls)} {runs} broke off before this one and {does} not count, taken for {what} of this machine: "
+        f"{len(stalls)} {runs} aborted before this one and {does} not count, taken for {what} of this machine: "
         f"{reasons}."
     )
 

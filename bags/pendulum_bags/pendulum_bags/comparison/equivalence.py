@@ -21,7 +21,7 @@ __all__ = ["EquivalenceTest", "Outcome", "Verdict", "conclude", "equivalence_tes
 POWER = 0.8
 """Probability with which the named number of runs would decide."""
 MOST_RUNS = 10_000
-_UNTOLD = "the motions are too little alike to tell it"
+_UNTOLD = "the motions are too dissimilar to measure it"
 
 
 class Outcome(str, Enum):

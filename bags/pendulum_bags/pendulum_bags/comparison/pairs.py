@@ -92,7 +92,7 @@ class Pair:
                 raise DataError(
                     f"the {run.label} of {run.source} fell: {run.joint} turned by "
                     f"{np.ptp(run.window.position):.3g} rad under the noise; expected a plant that is held, since two "
-                    "that tumble say nothing of each other: choose a smaller noise or another design"
+                    "that tumble cannot be compared: choose a smaller noise or another design"
                 )
         hardware = _turned(hardware, simulation)
         response = align_motion(simulation.window, hardware.window)

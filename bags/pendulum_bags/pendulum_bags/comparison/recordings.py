@@ -184,7 +184,7 @@ def _described(pairs: Sequence[tuple[RunData, RunData]], kind: str, shared: Shar
         elif kind:
             sentence = f"Undecided: {shared.why}, and aligned by themselves {far}; {varies}."
         else:
-            sentence = f"Undecided: {shared.why}, so that the motions say nothing of the plants."
+            sentence = f"Undecided: {shared.why}, so the plants cannot be compared."
         verdict, advice = Verdict(Outcome.UNDECIDED, sentence, (), margins, None), _ADVICE[kind]
     return Comparison(
         compared,

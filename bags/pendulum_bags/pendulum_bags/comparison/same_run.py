@@ -170,9 +170,9 @@ def paired_tests(
             continue  # nothing was taken out
         step = 2 if first == 0 else later
         # With the delay left in, it grows so steeply with the phase that few runs do not show the mean over runs.
-        kept = kind if first else replace(kind, runs_differ=False)
+        used = kind if first else replace(kind, runs_differ=False)
         for index, (what, margin) in enumerate((("angle", margins.path_angle), ("velocity", margins.path_velocity))):
-            tests.append(_path_test(runs, (first + index, first + index + step), f"{what}{note}", margin, kept))
+            tests.append(_path_test(runs, (first + index, first + index + step), f"{what}{note}", margin, used))
     return tests
 
 

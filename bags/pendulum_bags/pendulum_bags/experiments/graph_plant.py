@@ -87,6 +87,6 @@ def _refuse_others(orchestrator: Orchestrator, space: str) -> None:
     for topic in _COMMANDS:
         if count := orchestrator.node.count_publishers(f"{space}/{topic}") - ours.count(f"{space}/{topic}"):
             raise FaultError(
-                f"{space}/{topic} has {count} publisher{'s' * (count > 1)}: somebody else commands this plant; "
+                f"{space}/{topic} has {count} publisher{'s' * (count > 1)}: another program commands this plant; "
                 "expected no other commander"
             )

@@ -34,8 +34,8 @@ def new_run(
     try:
         yield folder
     except KeyboardInterrupt:
-        kept = "nothing was recorded" if discard_if_empty(folder) else f"{recorded} is in {folder}"
-        console.print(f"interrupted: {ended}; {kept}")
+        outcome = "nothing was recorded" if discard_if_empty(folder) else f"{recorded} is in {folder}"
+        console.print(f"interrupted: {ended}; {outcome}")
         raise typer.Exit(EXIT_INTERRUPTED) from None
     except PendulumError:
         discard_if_empty(folder)

@@ -73,7 +73,7 @@ def real_machine(hardware: str, lab: str | Path | None) -> RealMachine | None:
         return None
     if not lab:
         raise ParameterError(
-            "hardware is 'hebi' without a lab file; expected --lab FILE, which says which actuator it is, its zero, "
+            "hardware is 'hebi' without a lab file; expected --lab FILE, with the actuator's identity, its zero, "
             "sign and limits (python -m pendulum_hw_bridge lab new FILE writes one)"
         )
     path = Path(lab).expanduser().resolve()
@@ -108,7 +108,7 @@ def _saved_settings(machine: RealMachine, console: Console) -> Iterator[None]:
     said = _lab("backup", str(machine.path), "--out", str(folder))
     if said:
         shutil.rmtree(folder.parent, ignore_errors=True)
-        raise FaultError(f"the module's settings cannot be kept: {said}; nothing was started")
+        raise FaultError(f"the module's settings cannot be saved: {said}; nothing was started")
     try:
         yield
     finally:

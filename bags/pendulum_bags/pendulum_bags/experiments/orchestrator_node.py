@@ -258,7 +258,7 @@ class PlantClient:
 
     def resume(self, timeout: float) -> None:
         """Resume a paused plant."""
-        self.orchestrator.call(self._pause, SetBool.Request(data=False), f"{self.namespace} to go on", timeout)
+        self.orchestrator.call(self._pause, SetBool.Request(data=False), f"{self.namespace} to resume", timeout)
 
     def disarm_quietly(self) -> None:
         """Disarm on the way out; a plant without response must not prevent others from being disarmed."""
@@ -313,7 +313,7 @@ class PlantClient:
     def _transition(self, transition: int, what: str) -> None:
         request = ChangeState.Request(transition=Transition(id=transition))
         if not self.orchestrator.call(self._change_state, request, f"{self.namespace} controller to {what}").success:
-            raise FaultError(f"{self.namespace} controller does not {what}; its log says why")
+            raise FaultError(f"{self.namespace} controller does not {what}; see its log")
 
     def start_disturbance(self) -> Future:
         """Request the disturbance to start with the next state; returns at once."""

@@ -23,7 +23,7 @@ from typing import Any
 
 from pendulum_bags.experiments.host_pool import AGAIN, BEGUN, LAST, HostPool, share_pool
 from pendulum_msgs_py.programs.executables import EXIT_USAGE, run_package
-from pendulum_msgs_py.programs.realtime import priority_kept
+from pendulum_msgs_py.programs.realtime import preserved_priority
 from pendulum_msgs_py.programs.starter import end_with_starter
 
 __all__ = ["main"]
@@ -64,7 +64,7 @@ def _run(order: Mapping[str, Any], on_begin: Callable[[], None]) -> int:
     try:
         signal.signal(signal.SIGINT, signal.default_int_handler)
         on_begin()
-        with priority_kept():
+        with preserved_priority():
             code = run_package(order["package"], order["arguments"])
     except KeyboardInterrupt:
         code = 128 + signal.SIGINT

@@ -33,7 +33,7 @@ def is_stall(error: FaultError) -> bool:
     return name in STALLS or any(part in error.reason for part in SAID)
 
 
-def run_undisturbed(run: Callable[[], None], folder: Path, *, emulated: bool, tell: Callable[[str], None]) -> None:
+def run_undisturbed(run: Callable[[], None], folder: Path, *, emulated: bool, report: Callable[[str], None]) -> None:
     """Carry out a run, and repeat it if the computer stalled.
 
     Args:
@@ -51,13 +51,15 @@ def run_undisturbed(run: Callable[[], None], folder: Path, *, emulated: bool, te
                 raise
             last = attempt == ATTEMPTS
             # Recorded before anything is removed: a fault that only looks like a stall must not be selected away.
-            write_stall(folder, str(error), "" if not (folder / _LOGS).is_dir() else _LOGS if last else _kept(attempt))
+            write_stall(
+                folder, str(error), "" if not (folder / _LOGS).is_dir() else _LOGS if last else _logs_of(attempt)
+            )
             if last:
                 raise FaultError(
                     f"this machine stood still in each of {ATTEMPTS} runs, the last time so that {error}; close what "
                     "else runs on it, and measure again"
                 ) from error
-            tell(f"This machine stood still ({error}); measuring again, run {attempt + 1} of at most {ATTEMPTS}.")
+            report(f"This machine stood still ({error}); measuring again, run {attempt + 1} of at most {ATTEMPTS}.")
             _clear(folder, attempt)
         else:
             return
@@ -68,8 +70,8 @@ def _clear(folder: Path, attempt: int) -> None:
         shutil.rmtree(folder / bag, ignore_errors=True)
     logs = folder / _LOGS
     if logs.is_dir():
-        logs.rename(folder / _kept(attempt))
+        logs.rename(folder / _logs_of(attempt))
 
 
-def _kept(attempt: int) -> str:
+def _logs_of(attempt: int) -> str:
     return f"{_LOGS}_stalled_{attempt}"

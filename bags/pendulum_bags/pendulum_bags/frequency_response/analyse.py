@@ -193,25 +193,25 @@ def analyse_machine(machine: Path, plant: str, designs: Sequence[str] = (), ran:
         ParameterError: An invalid design.
     """
     measured = replace(read_response(machine), label="hw")
-    kept = _kept(machine)
+    stored = _stored(machine)
     return analyse_responses(
         [measured],
         plant,
-        designs or list(dict.fromkeys([*kept.designs, *ran])),
-        scaling=kept.scaling,
+        designs or list(dict.fromkeys([*stored.designs, *ran])),
+        scaling=stored.scaling,
         recorded=not designs,
     )
 
 
-class _Kept(NamedTuple):
+class _Stored(NamedTuple):
     designs: Sequence[str] = ()
     scaling: SignalScaling = DEFAULT_SCALING
 
 
-def _kept(machine: Path) -> _Kept:
+def _stored(machine: Path) -> _Stored:
     path = (machine if machine.is_dir() else machine.parent) / NUMBERS
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        return _Kept([one["text"] or one["name"] for one in content["designs"]], Scaling(**content["scaling"]))
+        return _Stored([one["text"] or one["name"] for one in content["designs"]], Scaling(**content["scaling"]))
     except (OSError, ValueError, KeyError, TypeError):
-        return _Kept()
+        return _Stored()

@@ -33,7 +33,7 @@ def carry_over(
         if designs:
             places = ", ".join(map(str, folders)) or "no folder"
             raise DataError(
-                f"--design needs the measured response of the machine, and {places} keeps none; expected --machine or "
+                f"--design needs the measured response of the machine, and {places} has none; expected --machine or "
                 "--layers with the folder of python -m pendulum_bags experiment frequency_response"
             )
         return None

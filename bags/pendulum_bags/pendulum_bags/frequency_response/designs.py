@@ -245,7 +245,7 @@ def _policy(path: str, plant: PlantParameters, certifier: Certifier, *, recorded
                 name,
                 None,
                 nothing,
-                f"it answers every {own:g} s, and the hardware was measured every {machine.period:g} s",
+                f"it commands every {own:g} s, and the hardware was measured every {machine.period:g} s",
                 text,
             )
         values = {"policy": text}
@@ -267,7 +267,7 @@ def _policy(path: str, plant: PlantParameters, certifier: Certifier, *, recorded
     unknown = ""
     if change > _NOT_LINEAR:
         unknown = (
-            f"it is no linear law near upright: its answer to disturbances {_LARGER:g} times as large differs by "
+            f"it is no linear law near upright: its response to disturbances {_LARGER:g} times as large differs by "
             f"{100.0 * change:.0f} %"
         )
     return DesignResult(name, None, certifier.feedback(answers[0][0], stable=True), unknown, text)

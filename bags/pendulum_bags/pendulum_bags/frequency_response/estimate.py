@@ -115,9 +115,9 @@ def _segments(record: Record) -> MeasuredResponse:
     window = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(size) + 0.5) / size)
 
     def spectra(values: Array) -> Complex:
-        kept = values[start:]
-        kept = kept - kept.mean()
-        pieces = np.stack([kept[k * half : k * half + size] for k in range(count)])
+        settled = values[start:]
+        settled = settled - settled.mean()
+        pieces = np.stack([settled[k * half : k * half + size] for k in range(count)])
         return np.fft.rfft(pieces * window, axis=1) / window.sum()
 
     r, u = spectra(record.excitation), spectra(record.torque)

@@ -103,7 +103,7 @@ def difference_sentence(difference: Difference) -> str:
     delay, gain = difference.delay, difference.gain
     return (
         f"They differ by more than {100.0 * SMALLEST:g} % at {n} of {total} frequencies; the gap is largest at "
-        f"{difference.gap_at:.2g} Hz. Over all, the hardware answers {abs(delay.value) * 1e3:.2f} ms "
+        f"{difference.gap_at:.2g} Hz. Over all, the hardware responds {abs(delay.value) * 1e3:.2f} ms "
         f"{'later' if delay.value >= 0.0 else 'earlier'} and {gain.value:.3g} times as strongly."
     )
 

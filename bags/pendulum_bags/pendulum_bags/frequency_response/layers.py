@@ -64,7 +64,7 @@ def same_plant(
             "extra delay of the hardware", "ms", 1e3 * delay.value, 1e3 * delay.low, 1e3 * delay.high, "", shown,
             "slope of the phase over all frequencies; lag and spring count too",
         ),
-        Evidence("gain of the hardware beside the simulation", "", gain.value, gain.low, gain.high, "", shown),
+        Evidence("gain of the hardware relative to the simulation", "", gain.value, gain.low, gain.high, "", shown),
         Evidence(
             f"frequencies that differ by more than {100.0 * SMALLEST:g} %", "", float(difference.lines_that_differ),
             None, None, "", shown, f"of {total}; error 5 % over all",
@@ -72,7 +72,7 @@ def same_plant(
     ]  # fmt: skip
     for measured, name in ((first, "simulation"), (second, "hardware")):
         weakest = float(measured.coherence[measured.driven].min())
-        note = "" if weakest > _WEAK_COHERENCE else "weak: a larger amplitude or more periods would tell more"
+        note = "" if weakest > _WEAK_COHERENCE else "weak: a larger amplitude or more periods would be more informative"
         evidence.append(Evidence(f"lowest coherence, {name}", "", weakest, mark=shown, note=note))
         if measured.distortion[1] == measured.distortion[1]:
             evidence.append(
@@ -177,7 +177,7 @@ def which_controllers(certifier: Certifier, designs: Sequence[DesignResult], *, 
         tuple(evidence),
         steps,
         limit if mark is Mark.YES else f"{_named(bad or rejected, count)} not certified for the hardware",
-        f"{limit}; {', '.join(d.name for d in good)} certified to be stable there, which tells nothing of how "
+        f"{limit}; {', '.join(d.name for d in good)} certified to be stable there, which does not show how "
         "closely it moves as simulated"
         if good
         else "",

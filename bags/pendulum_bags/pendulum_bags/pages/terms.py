@@ -101,7 +101,7 @@ TERMS: Mapping[str, Term] = {
     "delay": Term(
         "delay",
         r"response delay|delay",
-        "By how much the hardware answers one and the same disturbance later than the simulation. It has transport, "
+        "By how much the hardware responds one and the same disturbance later than the simulation. It has transport, "
         "sampling and the actuator's lag in it. The test takes it at one phase of the noise samples; the shift of the "
         "cross-correlation's peak does not, and is larger by up to a period.",
     ),

@@ -131,7 +131,7 @@ def torque_and_noise(data: ReportData) -> Figure | str:
         Trace(hw.t, hw.effort, "hardware u", "hw", "step"),
     ]
     sentence = (
-        f"The noise reaches {quantity(largest, 'N m')}; the controllers answer with at most {quantity(reach, 'N m')}, "
+        f"The noise reaches {quantity(largest, 'N m')}; the controllers respond with at most {quantity(reach, 'N m')}, "
         f"which is {100.0 * factor:.0f} % of it: the plant's damping, not the controller, absorbs the rest. "
         f"Below, the noise is scaled by {factor:.3g}."
     )

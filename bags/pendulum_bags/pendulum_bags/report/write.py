@@ -68,9 +68,9 @@ def write_report(
     content = {**comparison.to_json(), **(summary or {})}
     replays = [replay_recording(path, "dfki") for path in recordings]
     names = [Path(folder).name for folder in folders] or [out.resolve().name]
-    kept = [Path(folder) for folder in folders] if len(folders) == 1 else [] if folders else [out]
-    certified = certified or carry_over(comparison, kept)
-    answer = answer or answer_of(comparison, kept, updated=layers_of(certified))
+    sources = [Path(folder) for folder in folders] if len(folders) == 1 else [] if folders else [out]
+    certified = certified or carry_over(comparison, sources)
+    answer = answer or answer_of(comparison, sources, updated=layers_of(certified))
     known = [read_trials(path) for path in trials]
     data = ReportData(comparison, content, replays, names, known, answer, certified, open_bag)
     figures, missing = make_figures(data)

@@ -64,13 +64,13 @@ def _with_switch(recording: Recording, reading: Reading) -> Recording:
     columns = reading.columns
     if not {"goal_position", "torque_enable"} <= columns.columns.keys() or recording.input_kind != "position_goal":
         return recording
-    kept = first_of_each_stamp(columns.values("timestamp"))
+    rows = first_of_each_stamp(columns.values("timestamp"))
     meta = dict(recording.meta)
     if "load" in columns.columns:
         # The register is 16 bit two's complement in thousandths of full duty.
-        load = columns.values("load")[kept]
+        load = columns.values("load")[rows]
         meta["load"] = np.where(load > 32767, load - 65536, load) / 1000.0
     for key in ("input_volts", "temp"):
         if key in columns.columns:
-            meta[f"mean_{key}"] = float(columns.values(key)[kept].mean())
-    return replace(recording, enabled=columns.values("torque_enable")[kept], meta=meta)
+            meta[f"mean_{key}"] = float(columns.values(key)[rows].mean())
+    return replace(recording, enabled=columns.values("torque_enable")[rows], meta=meta)

@@ -189,7 +189,7 @@ def timing_warning(plants: Mapping[str, Mapping[str, Any]]) -> str:
     ]
     if not words:
         return ""
-    return f"States are missing: {', '.join(words)}; look for pauses, end other programs, and repeat the run."
+    return f"States are missing: {', '.join(words)}; check for pauses, end other programs, and repeat the run."
 
 
 def missed_share(missed: int, samples: int) -> float:

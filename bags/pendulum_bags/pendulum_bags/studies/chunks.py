@@ -119,7 +119,7 @@ def cluster_client(scheduler: str = "", workers: int = 0) -> Iterator[Any]:
         except (OSError, ValueError, TypeError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise FaultError(
-                f"no Dask scheduler answers at {scheduler!r} within {_CONNECT_TIMEOUT:g} s ({reason}); "
+                f"no Dask scheduler responds at {scheduler!r} within {_CONNECT_TIMEOUT:g} s ({reason}); "
                 "expected tcp://HOST:PORT of a running dask scheduler"
             ) from error
         with closing(client):
@@ -147,7 +147,7 @@ def _on_cluster(
             future.release()
     except KilledWorker as error:
         raise FaultError(
-            f"workers keep dying: {str(error).splitlines()[0]}; finished pieces are kept, and the same command resumes"
+            f"workers keep dying: {str(error).splitlines()[0]}; finished pieces remain, and the same command resumes"
         ) from error
     finally:
         for future in jobs:
@@ -199,7 +199,7 @@ def read_columns(path: Path, names: Iterable[str]) -> dict[str, NDArray[Any]]:
     try:
         table = parquet.read_table(path, columns=list(names))
     except (OSError, ValueError) as error:
-        raise BagError(f"{path} cannot be read ({error}); remove it, and the same command computes it anew") from error
+        raise BagError(f"{path} cannot be read ({error}); remove it, and the same command computes it again") from error
     return {name: table[name].to_numpy() for name in names}
 
 

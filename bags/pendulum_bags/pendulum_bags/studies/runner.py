@@ -59,8 +59,8 @@ def open_study_folder(folder: Path, study: Study) -> Study:
     Raises:
         BagError: The folder holds something else, or runs that this study does not have.
     """
-    kept = folder / "study.yaml"
-    if not kept.is_file():
+    stored = folder / "study.yaml"
+    if not stored.is_file():
         if folder.exists() and any(folder.iterdir()):
             raise BagError(f"folder {folder} is not empty and holds no study; expected a new one")
         folder.mkdir(parents=True, exist_ok=True)

@@ -62,7 +62,7 @@ def same_run_layer(comparison: Comparison, *, more: str = "", refused: str = "")
         reason = verdict.sentence.removeprefix("Undecided: ").rstrip(".")
         if tests and comparison.is_paired and not comparison.unlike_references:
             open_tests = [test for test in tests if test.outcome is Outcome.UNDECIDED]
-            reason = f"{runs} cannot tell yet in {', '.join(test.quantity for test in open_tests)}"
+            reason = f"{runs} cannot decide yet on {', '.join(test.quantity for test in open_tests)}"
         steps = (_what_it_takes(comparison, more),)
     sentence = f"{reason[0].upper()}{reason[1:]}."
     evidence = tuple(map(_evidence, tests))
@@ -129,7 +129,7 @@ def in_words(test: EquivalenceTest) -> str:
     allowed = f"{test.high if value >= 0.0 or not math.isfinite(test.low) else -test.low:.3g}{unit} allowed"
     if test.quantity == "delay":
         when = "later" if value >= 0.0 else "earlier"
-        return f"the hardware answers {abs(value):.3g}{unit} {when} than the simulation ({allowed})"
+        return f"the hardware responds {abs(value):.3g}{unit} {when} than the simulation ({allowed})"
     if test.quantity.startswith("mean "):
         what = test.quantity.removeprefix("mean ").split(" ", maxsplit=1)[0]
         way = "higher" if value >= 0.0 else "lower"
@@ -226,7 +226,7 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest], refused
         )
         if fitted:
             steps.append(
-                "If that says no too, no parameters will do: the model lacks what the hardware does. Measure which "
+                "If that is no too, no parameters suffice: the model lacks what the hardware does. Measure which "
                 f"designs are safe all the same ({how_to_measure(comparison)[Layer.WHICH_CONTROLLERS]})."
             )
     elif late is not None and foreign:
@@ -238,7 +238,7 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest], refused
             "then measure again with --plant."
         )
     if any(name.startswith("mean") for name in names):
-        steps.append("Look for an offset: angle_offset or torque_offset in the plant file, or dry friction.")
+        steps.append("Check for an offset: angle_offset or torque_offset in the plant file, or dry friction.")
     return tuple(steps)
 
 
@@ -272,8 +272,8 @@ def _test_of_the_plant(comparison: Comparison, plant: str) -> str:
     if not command:
         return f"simulate and design with --plant {shlex.quote(plant)}, and compare again under noise of another seed."
     return (
-        f"test that file under other noise ({command}). MODEL INCOMPLETE, if identify says so, is no reason to stop: "
-        "the parameters stand in for what the model lacks, and the test tells whether they suffice for this "
+        f"test that file under other noise ({command}). MODEL INCOMPLETE, if identify reports it, is no reason to "
+        "stop: the parameters compensate for what the model lacks, and the test shows whether they suffice for this "
         f"controller.{question_of(command)}"
     )
 
@@ -303,7 +303,7 @@ def _what_it_takes(comparison: Comparison, more: str) -> str:
         return "Record both plants under one and the same disturbance (make experiment does)."
     runs = comparison.verdict.more_runs
     if any(math.isnan(test.interval.estimate) for test in comparison.verdict.tests):
-        return "Record both under a disturbance that moves them more: too little is alike to tell a delay."
+        return "Record both under a disturbance that moves them more: they are too dissimilar to show a delay."
     if runs is None:
         return "More runs would hardly decide it: a difference sits on its margin; state another margin, or mend it."
     duration = comparison.pairs[0].hardware.window.duration

@@ -298,7 +298,7 @@ class _Run:
                 self.machine.discard()
                 raise
 
-        run_undisturbed(run, self.folder, emulated=settings.is_emulated, tell=self.progress.start_again)
+        run_undisturbed(run, self.folder, emulated=settings.is_emulated, report=self.progress.start_again)
 
     def _measure_joints(self, settings: JointSettings, leaving: ExitStack) -> None:
         """Make the first recordings of a plant of several joints: in lockstep, or as it is held upright."""

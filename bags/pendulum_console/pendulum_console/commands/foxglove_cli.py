@@ -24,7 +24,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 
 @app.command(
-    epilog="Example: python -m pendulum_console foxglove --port 8765. ROS arguments go behind --ros-args; the ROS "
+    epilog="Example: python -m pendulum_console foxglove --port 8765. ROS arguments follow --ros-args; the ROS "
     "domain is that of ROS_DOMAIN_ID."
 )
 def foxglove(

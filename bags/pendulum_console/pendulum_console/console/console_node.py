@@ -270,7 +270,7 @@ class Hub:
         )
         request = ChangeState.Request(transition=Transition(id=number, label=label))
         if not (await self._call(ChangeState, f"{node}/change_state", request)).success:
-            raise FaultError(f"{node} does not {label}: it says {self.said(node) or 'nothing'!r}; its log says why")
+            raise FaultError(f"{node} does not {label}: it says {self.said(node) or 'nothing'!r}; see its log")
         return f"{node}: {label}d"
 
     async def set_parameter(self, node: str, name: str, value: Any) -> None:
@@ -318,7 +318,7 @@ class Hub:
         try:
             return await asyncio.wait_for(answered, _TIMEOUT)
         except asyncio.TimeoutError:
-            raise FaultError(f"{service} does not answer within {_TIMEOUT:g} s") from None
+            raise FaultError(f"{service} does not respond within {_TIMEOUT:g} s") from None
 
     def _spin(self) -> None:
         while not self._done.done():

@@ -80,7 +80,7 @@ class ControllerChoice:
         said = self._graph.said(self._controller)
         job = self._jobs[f"control{self._space}"]
         self._state.text = (
-            f"{running.get('controller', 'controller')}: {said or 'says nothing'}"
+            f"{running.get('controller', 'controller')}: {said or 'reports nothing'}"
             if running
             else f"no controller · {job.describe()}"
             if job is not None

@@ -209,7 +209,7 @@ class LiveNode(PollingNode):
         future.add_done_callback(lambda _: answered.set())
         if not answered.wait(_TIMEOUT):
             client.remove_pending_request(future)
-            raise FaultError(f"{name} does not answer within {_TIMEOUT:g} s")
+            raise FaultError(f"{name} does not respond within {_TIMEOUT:g} s")
         return future.result()
 
     def _on_values(self, values: Mapping[str, Mapping[str, Any]], changed: str) -> None:

@@ -29,7 +29,7 @@ _END = b"\r\n\r\n"
 class Gate:
     """Listens at ``port`` (0 for any), and connects admitted clients to a server at an address and port.
 
-    ``refusal`` returns why a request is refused, or nothing; ``tell`` gets a line on each client; both are called in
+    ``refusal`` returns why a request is refused, or nothing; ``report`` gets a line on each client; both are called in
     any thread. A ParameterError if address or port are not available.
     """
 
@@ -39,11 +39,11 @@ class Gate:
         port: int,
         server: tuple[str, int],
         refusal: Callable[[Request], str],
-        tell: Callable[[str], None],
+        report: Callable[[str], None],
     ) -> None:
         self._server = server
         self._refusal = refusal
-        self._tell = tell
+        self._report = report
         self._open: set[socket.socket] = set()
         self._lock = threading.Lock()
         self._closing = False
@@ -88,8 +88,8 @@ class Gate:
                 if server is None:
                     return
                 leaving.callback(self._forget, server)
-                self._tell(f"{who} is connected")
-                leaving.callback(self._tell, f"{who} has gone")
+                self._report(f"{who} is connected")
+                leaving.callback(self._report, f"{who} has gone")
                 self._start(_carry, server, client, _PAUSE)
                 _carry(client, server, 0.0)
             except OSError:
@@ -128,7 +128,7 @@ class Gate:
         head = f"HTTP/1.1 {status}\r\nContent-Type: text/plain; charset=utf-8\r\nContent-Length: {len(text)}\r\n"
         client.sendall(f"{head}Connection: close\r\n\r\n".encode() + text)
         if who:
-            self._tell(f"{who} is refused: {why}")
+            self._report(f"{who} is refused: {why}")
 
     def _forget(self, each: socket.socket) -> None:
         with self._lock:

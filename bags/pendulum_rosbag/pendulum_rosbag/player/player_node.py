@@ -246,7 +246,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 @app.command(
     epilog="Example: python -m pendulum_rosbag play runs/today/sim -t /sim/joint_states --remap "
-    "/sim/joint_states:=/joint_states --rate 0.5. ROS arguments go behind --ros-args."
+    "/sim/joint_states:=/joint_states --rate 0.5. ROS arguments follow --ros-args."
 )
 def play(
     context: typer.Context,

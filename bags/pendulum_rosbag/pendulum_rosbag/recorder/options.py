@@ -84,12 +84,12 @@ class RecorderOptions:
     def unmet(self, met: Iterable[str]) -> dict[str, str]:
         """Return the requested topics that were not published, with reasons; ``met`` are those that had a publisher."""
         found = list(met)
-        unmet = {name: "nobody published it" for name in self.topics if self.wants(name) and name not in found}
+        unmet = {name: "it had no publisher" for name in self.topics if self.wants(name) and name not in found}
         unmet |= {name: "it is left out by the pattern of exclude" for name in self.topics if not self.wants(name)}
         if self.regex and not any(re.search(self.regex, name) for name in found):
-            unmet[f"topics that match {self.regex!r}"] = "nobody published any"
+            unmet[f"topics that match {self.regex!r}"] = "they had no publisher"
         if not self.topics and not self.regex and not found:
-            unmet["any topic"] = "nobody published one"
+            unmet["any topic"] = "none had a publisher"
         return unmet
 
 

@@ -20,7 +20,7 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 @app.command(
     epilog="Example: python -m pendulum_rosbag record -o runs/today --regex '^/(sim|hw)/' --compression zstd. "
-    "ROS arguments go behind --ros-args."
+    "ROS arguments follow --ros-args."
 )
 def record(
     context: typer.Context,

@@ -58,7 +58,7 @@ class SealedMcapFile:
         self._group_index: dict[int, list[bytes]] = {}
         self._group_span = _NO_SPAN
         self._stale = False
-        self._kept: list[Attachment | Metadata] = []
+        self._records: list[Attachment | Metadata] = []
         self._layout = McapLayout(path, rec.MAGIC + rec.header_record(f"pendulum_rosbag {__version__}"), self._summary)
 
     @property
@@ -138,7 +138,7 @@ class SealedMcapFile:
 
     def keep(self, record: Attachment | Metadata) -> None:
         """Store an attachment or a metadata record when the file is closed."""
-        self._kept.append(record)
+        self._records.append(record)
 
     def seal(self) -> None:
         """Write everything so far to the file."""
@@ -170,7 +170,7 @@ class SealedMcapFile:
             finally:
                 # Also after a failed seal: on a full disk the unused room is worth giving back.
                 own = [Metadata("rosbag2", {"serialized_metadata": metadata})] if metadata else []
-                self._layout.finish([*self._kept, *own])
+                self._layout.finish([*self._records, *own])
             self._layout.sync()
         finally:
             self.abandon()

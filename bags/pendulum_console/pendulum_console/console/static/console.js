@@ -229,7 +229,7 @@
 
   function connect() {
     const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/stream`);
-    // A server that takes the connection and then says nothing is tried anew, too.
+    // A server that takes the connection and then reports nothing is tried anew, too.
     const patience = setInterval(() => { if (performance.now() - heard > 3000) { heard = performance.now() - LIMIT - 1; socket.close(); } }, 1000);
     socket.onopen = () => { state.connected = true; behind = Infinity; };
     socket.onmessage = (event) => { take(JSON.parse(event.data)); };
