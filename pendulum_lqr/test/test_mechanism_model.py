@@ -12,6 +12,7 @@ import scipy.linalg
 
 from pendulum_lqr.controller_interface.controller import make_controller
 from pendulum_lqr.design_command.design_cli import main
+from pendulum_lqr.design_command.figures import release_figure
 from pendulum_lqr.linear.analysis import analyse, delayed_spectral_radius
 from pendulum_lqr.linear.design import DesignError, continuous_lqr, output_lqr
 from pendulum_lqr.linear.model import holding_effort, linearise
@@ -195,4 +196,42 @@ def test_the_command_prints_gains_of_several_joints(capsys: pytest.CaptureFixtur
     assert main(["--preset", "acrobot", "--q", "1,1"]) == 2
     assert "expected 4 numbers, for shoulder, elbow, shoulder_dot, elbow_dot" in capsys.readouterr().err
     assert main(["--preset", "acrobot", "--theta", "1"]) == 2
-    assert "has several joints; expected --q, --r, --row and --json alone" in capsys.readouterr().err
+    assert "expected --theta, --effort-limit and --tracking left out: a passive joint" in capsys.readouterr().err
+
+
+def test_the_worst_case_of_a_mechanism_is_that_of_its_own_parameters(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    uncertain = ["--uncertainty", "pole_mass=50%", "--uncertainty", "cart.transport_delay=0:0.2"]
+    assert main(["--preset", "cart_pole", *uncertain, "--json"]) == 0
+    document = json.loads(capsys.readouterr().out)
+    bounds = document["uncertainty"]["bounds"]
+    assert bounds == {"pole_mass": pytest.approx([0.05, 0.15]), "cart.transport_delay": [0.0, 0.2]}
+    worst, plant = document["rows"][1]["worst_case"], load_mechanism("cart_pole")
+    gain = output_lqr(linearise(plant), *plant.mechanism.weights).K
+    # The worst plant is one that the sampled loop, which shares no margins with it, loses too.
+    assert 0 < worst["unstable"] < worst["plants"]
+    assert delayed_spectral_radius(linearise(plant.with_values(worst["where"])), gain, 1e-3) > 1.0
+    file = write_plant(
+        tmp_path / "p.yaml", plant, provenance={"source": "a test"}, intervals={"pole_mass": [0.09, 0.11]}
+    )
+    assert main(["--plant", str(file), "--uncertainty", "identified"]) == 0
+    assert "holds every one of 51 plants over pole_mass 0.09 to 0.11 kg" in " ".join(capsys.readouterr().out.split())
+    for options, sentence in (
+        (["cart_pole", "--uncertainty", "mass_2=10%"], "--uncertainty names 'mass_2'"),
+        (["double_pendulum", "--uncertainty", "mass_2=10%"], "has 2 motors; expected --machine and --uncertainty left"),
+    ):
+        assert main(["--preset", *options]) == 2
+        assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("name", "figures"), [("reaction_wheel", 4), ("triple_pendulum", 3)])
+def test_figures_of_mechanisms_show_a_release(name: str, figures: int, tmp_path: Path) -> None:
+    assert main(["--preset", name, "--figures", str(tmp_path)]) == 0
+    assert len(list(tmp_path.glob("*.png"))) == figures
+    plant = load_mechanism(name)
+    gain = output_lqr(linearise(plant), *plant.mechanism.weights)
+    figure = release_figure(plant, linearise(plant), {"own": gain.K})
+    swung = [np.asarray(ax.lines[0].get_ydata()) for ax in figure.axes]
+    assert swung[0][0] == pytest.approx(0.05)
+    assert all(abs(values[-1]) < 0.15 * np.max(np.abs(values)) for values in swung)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pendulum_bags.commands.experiment_cli import main
-from pendulum_bags.studies.monte_carlo import MonteCarlo, replay, run_chunk, run_monte_carlo
+from pendulum_bags.studies.monte_carlo import MonteCarlo, replay, run_chunk, run_monte_carlo, sobol
 from pendulum_bags.studies.region_map import RegionMap, run_map
 from pendulum_bags.studies.uncertain import Uncertainty, parse_uncertainty
 from pendulum_msgs_py.errors import BagError, ParameterError
@@ -158,13 +158,25 @@ def test_what_cannot_be_run_is_refused(change: dict[str, object]) -> None:
         replace(SMALL, **change)  # type: ignore[arg-type]
 
 
+def test_sobol_indices_of_each_joint_name_the_start_or_the_noise_that_moves_it_and_no_friction() -> None:
+    for start, amplitude, cause in ((0.05, 0.0, "start_pole"), (0.0, 0.5, "noise")):
+        found = sobol(replace(SMALL, start=start, amplitude=amplitude), base=128)
+        assert [each["output"] for each in found] == ["std_cart", "std_pole"]
+        total = {each["factor"]: each["total"] for each in found[1]["indices"]}
+        assert max(total, key=lambda name: total[name]) == cause
+        assert abs(total["pole.damping"]) < 0.02
+        # Saltelli: one run for each factor's own sample, and two of the base.
+        assert found[0]["runs"] == 128 * (len(total) + 2)
+
+
 def test_the_command_tells_and_replays_and_refuses_options_of_one_joint(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("pyarrow")
     own = ["monte_carlo", "--plant", "cart_pole", "--runs", "50", "--duration", "0.2", "--out", str(tmp_path / "mc")]
-    assert main([*own, "--json"]) == 0
+    assert main([*own, "--sobol", "2", "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
+    assert [found["output"] for found in content["sobol"]] == ["std_cart", "std_pole"]
     assert content["runs"] == 50
     assert content["units"]["max_cart"] == "m"
     assert content["units"]["max_effort_cart"] == "N"
@@ -175,6 +187,6 @@ def test_the_command_tells_and_replays_and_refuses_options_of_one_joint(
     assert rows[0] == ["time_s", "cart_m", "pole_rad", "cart_m_s", "pole_rad_s", "cart_effort_n", "pole_effort_n_m"]
     assert len(rows) == 101
     assert "cart_mass" in capsys.readouterr().out
-    for option in (["--q", "1", "2"], ["--r", "1"], ["--sobol", "8"]):
+    for option in (["--q", "1", "2"], ["--r", "1"]):
         assert main([*own, *option]) == 2
         assert f"error: {option[0]} is for a plant of one joint, and cart_pole has several" in capsys.readouterr().err

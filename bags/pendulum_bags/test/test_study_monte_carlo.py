@@ -183,7 +183,7 @@ def test_without_a_gpu_the_program_says_so_in_one_sentence(tmp_path: Path) -> No
 
 
 def test_sobol_indices_see_that_noise_rules_and_damping_comes_next() -> None:
-    found = sobol(replace(SMALL, duration=1.0, uncertainty=Uncertainty({"damping": 0.2, "gravity": 0.05})), base=256)
+    (found,) = sobol(replace(SMALL, duration=1.0, uncertainty=Uncertainty({"damping": 0.2, "gravity": 0.05})), base=256)
     total = {entry["factor"]: entry["total"] for entry in found["indices"]}
     assert total["noise"] > total["damping"] > total["gravity"]
 

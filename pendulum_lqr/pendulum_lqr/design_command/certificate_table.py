@@ -12,26 +12,40 @@ from pendulum_lqr.design_command.design_tables import RowTable
 from pendulum_lqr.linear.design import Gain
 from pendulum_lqr.linear.model import LinearModel
 from pendulum_lqr.responses.certificate import Certificate, Certifier
+from pendulum_lqr.responses.gap_metric import JointScaling
 from pendulum_lqr.responses.machine_response import Machine
 from pendulum_lqr.responses.measured_response import read_response
-from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["certificate_document", "certify_rows", "print_certificates"]
 
 
-def certify_rows(path: Path, model: LinearModel, gains: Sequence[Gain]) -> tuple[Certifier, list[Certificate]]:
-    """Return the certificates of a table's gains on angle and velocity, for an upright model.
+def certify_rows(
+    path: Path, plant: PlantParameters, model: LinearModel, gains: Sequence[Gain]
+) -> tuple[Certifier, list[Certificate]]:
+    """Return the certificates of a table's gains of one motor, for a model of the plant at the upright position.
 
     Raises:
-        ParameterError: The designs are not for upright.
+        ParameterError: The designs are not for upright, or the response is of other joints.
         DataError: The file, or run folder, holds no response.
     """
-    if model.theta != UPRIGHT:
+    if tuple(model.position) != plant.coordinates.goal:
         raise ParameterError(
             f"--machine was measured upright and the design is for theta = {model.theta:.4f} rad; expected pi"
         )
-    certifier = Certifier(model, Machine.of(read_response(path)))
+    measured = read_response(path)
+    ours = () if plant.is_pendulum else plant.coordinates.names
+    if measured.joints != ours:
+        raise ParameterError(
+            f"--machine {path} was measured on {', '.join(measured.joints) or 'a plant of one joint'}; expected "
+            f"{', '.join(ours) or 'one joint'}, as {plant.name}"
+        )
+    if plant.is_pendulum:
+        certifier = Certifier(model, Machine.of(measured))
+    else:
+        scaling = JointScaling.of_plant(plant, model.measured)
+        certifier = Certifier(model, Machine.relative_to(measured, model), scaling)
     return certifier, [certifier.gain(gain.K) for gain in gains]
 
 

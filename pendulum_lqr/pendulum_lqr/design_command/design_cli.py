@@ -41,9 +41,7 @@ from pendulum_msgs_py.plants.plant_parameters import (
     MECHANISM_PRESETS,
     PRESET_NAMES,
     PlantParameters,
-    is_mechanism,
     load_mechanism,
-    load_plant,
 )
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json
@@ -89,7 +87,8 @@ def design(
         list[str] | None,
         typer.Option(
             help="Worst margins over plants that are possible: inertia=10%, or transport_delay=0:0.01 (lowest and "
-            f"highest value); may be given again ({', '.join(UNCERTAIN)}). Or identified: intervals of the plant file."
+            f"highest value); may be given again ({', '.join(UNCERTAIN)}; of several joints mass_2=10% or "
+            "elbow.damping=20%). Or identified: intervals of the plant file."
         ),
     ] = None,
     tracking: Annotated[
@@ -119,36 +118,37 @@ def design(
     """
     chosen_plant = str(plant) if plant is not None else preset
     require_determined(chosen_plant)
-    if is_mechanism(chosen_plant):
-        if any((figures, machine, theta != UPRIGHT, effort_limit, uncertainty, tracking)):
+    parameters = load_mechanism(chosen_plant)
+    own: Sequence[tuple[tuple[float, ...], float]] = THESIS_WEIGHTS
+    fixed, limit = theta if parameters.is_pendulum else None, 0.0
+    if parameters.is_pendulum:
+        limit = _limit(effort_limit, parameters.effort_limit)
+    else:
+        own = (parameters.mechanism.weights,)
+        if any((theta != UPRIGHT, effort_limit, tracking)):
             raise ParameterError(
-                f"plant {chosen_plant!r} has several joints; expected --q, --r, --row and --json alone: figures, "
-                "--machine, --uncertainty, --tracking, --theta and --effort-limit are for one joint"
+                f"plant {chosen_plant!r} has several joints; expected --theta, --effort-limit and --tracking left out: "
+                "a passive joint follows no reference of its own"
             )
-        mechanism = load_mechanism(chosen_plant)
-        own = (mechanism.mechanism.weights,)
-        table = _designed(mechanism, linearise(mechanism), q, r, own, row)
-        if as_json:
-            sys.stdout.write(json_text(table.document()) + "\n")
-        else:
-            table.show(make_console(highlight=False))
-        return
-    parameters = load_plant(chosen_plant)
-    limit = _limit(effort_limit, parameters.effort_limit)
-    table = _designed(parameters, linearise(parameters, theta), q, r, THESIS_WEIGHTS, row)
+        if (driven := len(parameters.effort_limits)) > 1 and (machine or uncertainty):
+            raise ParameterError(
+                f"plant {chosen_plant!r} has {driven} motors; expected --machine and --uncertainty left out: margins "
+                "are those of one motor's loop"
+            )
+    table = _designed(parameters, linearise(parameters, fixed), q, r, own, row)
     model, gains, weights, chosen = table.model, table.gains, table.weights, table.chosen
-    certified = certify_rows(machine, model, gains) if machine is not None else None
+    certified = certify_rows(machine, parameters, model, gains) if machine is not None else None
     follower = design_tracking(tracking, parameters, weights[chosen - 1], limit) if tracking else None
-    in_time = [time_figures(model, gain.K, parameters) for gain in gains]
+    in_time = [time_figures(model, gain.K, parameters) for gain in gains] if parameters.is_pendulum else []
     box = parse_box(uncertainty, parameters, plant) if uncertainty else None
     worst = []
     if box is not None:
         possible = box.plants(parameters)
         print(f"asking {len(possible)} plants with {len(gains)} gains ...", file=sys.stderr)
-        worst = [worst_case(possible, gain.K, theta, tuple(box.bounds)) for gain in gains]
+        worst = [worst_case(possible, gain.K, fixed, tuple(box.bounds)) for gain in gains]
     if as_json:
         document = table.document()
-        for line, figure in zip(document["rows"][1:], in_time, strict=True):
+        for line, figure in zip(document["rows"][1:], in_time, strict=parameters.is_pendulum):
             line["time"] = None if figure is None else figure.to_dict()
         if box is not None:
             document["uncertainty"] = {"source": box.source, "bounds": {n: list(b) for n, b in box.bounds.items()}}
@@ -162,9 +162,10 @@ def design(
     else:
         console = make_console(highlight=False)
         table.show(console)
-        print_time_figures(console, in_time, chosen, limit)
+        if parameters.is_pendulum:
+            print_time_figures(console, in_time, chosen, limit)
         if box is not None:
-            print_worst_cases(console, box, worst, chosen)
+            print_worst_cases(console, parameters, box, worst, chosen)
         if follower is not None:
             print_tracking(console, follower, chosen)
         if certified is not None:
@@ -318,7 +319,7 @@ def _save(plant: PlantParameters, table: _Table, effort_limit: float, folder: Pa
     from pendulum_lqr.design_command.figures import design_figures
 
     rows = [
-        (f"{index}: Q = ({diagonal[0]:g}, {diagonal[1]:g}), R = {cost:g}", gain)
+        (f"{index}: Q = ({', '.join(f'{weight:g}' for weight in diagonal)}), R = {cost:g}", gain)
         for index, ((diagonal, cost), gain) in enumerate(zip(table.weights, table.gains, strict=True), start=1)
     ]
     paths = []

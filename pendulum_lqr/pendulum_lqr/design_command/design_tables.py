@@ -11,7 +11,7 @@ from pendulum_lqr.design_command.time_figures import TimeFigures
 from pendulum_lqr.linear.analysis import Margins
 from pendulum_lqr.linear.model import LinearModel
 from pendulum_lqr.linear.parameter_box import ParameterBox, WorstCase
-from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.terminal import WholeTable
 
 __all__ = [
@@ -23,8 +23,6 @@ __all__ = [
     "print_worst_cases",
     "time_cell",
 ]
-
-_UNITS = {spec.name: spec.unit for spec in PLANT_SPECS}
 
 
 class RowTable(WholeTable):
@@ -110,7 +108,9 @@ def print_time_figures(console: Console, found: Sequence[TimeFigures | None], ch
     )
 
 
-def print_worst_cases(console: Console, box: ParameterBox, found: Sequence[WorstCase], chosen: int) -> None:
+def print_worst_cases(
+    console: Console, plant: PlantParameters, box: ParameterBox, found: Sequence[WorstCase], chosen: int
+) -> None:
     """Print one line per row: the worst of each margin over all plants, and the worst plant."""
     headings = ("#", "not held", "gain up", "gain down", "phase margin", "delay margin", "modulus", "worst at")
     table = RowTable(f"Worst case over {found[0].plants} plants ({box.source})", headings, left={"worst at"})
@@ -120,22 +120,24 @@ def print_worst_cases(console: Console, box: ParameterBox, found: Sequence[Worst
         if margins is not None and not one.unstable:
             cells = margin_cells(margins)
         held = f"{one.unstable}" if one.unstable else "none"
-        table.add(index, held, *cells, _place(one.where), chosen=chosen)
+        table.add(index, held, *cells, _place(plant, one.where), chosen=chosen)
     console.print(table)
-    ranges = ", ".join(f"{name} {low:.4g} to {high:.4g} {_UNITS[name]}" for name, (low, high) in box.bounds.items())
+    ranges = ", ".join(
+        f"{name} {low:.4g} to {high:.4g} {plant.specs[name].unit}" for name, (low, high) in box.bounds.items()
+    )
     one = found[chosen - 1]
     if one.unstable:
         console.print(
             f"combination {chosen} is NOT safe over {ranges}: it does not hold {one.unstable} of {one.plants} plants, "
-            f"such as {_place(one.where)}",
+            f"such as {_place(plant, one.where)}",
             style="bold red",
         )
     else:
         console.print(f"combination {chosen} holds every one of {one.plants} plants over {ranges}")
 
 
-def _place(where: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} {value:.4g} {_UNITS[name]}" for name, value in where.items())
+def _place(plant: PlantParameters, where: Mapping[str, float]) -> str:
+    return ", ".join(f"{name} {value:.4g} {plant.specs[name].unit}" for name, value in where.items())
 
 
 def hidden_and_late(model: LinearModel) -> list[str]:

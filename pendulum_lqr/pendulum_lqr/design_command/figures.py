@@ -27,6 +27,7 @@ from pendulum_lqr.linear.model import (
 )
 from pendulum_lqr.linear.roa import Region, region_of_attraction, rigid_rollout
 from pendulum_msgs_py.contract.angles import UPRIGHT
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = [
     "bode_figure",
@@ -34,6 +35,7 @@ __all__ = [
     "phase_portrait_figure",
     "pole_map_figure",
     "region_to_show",
+    "release_figure",
     "root_locus_figure",
     "step_figure",
 ]
@@ -226,6 +228,37 @@ def step_figure(model: LinearModel, gains: Mapping[str, Array], report: LoopRepo
     return figure
 
 
+def release_figure(plant: PlantParameters, model: LinearModel, gains: Mapping[str, Array]) -> Figure:
+    """Return the driven efforts and each joint after a release off upright, linear.
+
+    The joint that has to be balanced, the last with a goal, starts 0.05 off.
+    """
+    joints, driven = plant.coordinates.joints, plant.coordinates.driven
+    figure, axes = _figure(len(joints) + 1, 2.0 + 1.6 * len(joints))
+    start = np.zeros(model.A.shape[0])
+    start[max(i for i, joint in enumerate(joints) if joint.goal)] = 0.05
+    for index, (label, K) in enumerate(gains.items()):
+        gain = np.atleast_2d(K) @ model.C
+        A = model.A - model.B @ gain
+        # Until the slowest motion is over.
+        times = np.linspace(0.0, 6.0 / max(-float(np.linalg.eigvals(A).real.max()), 1e-3), 800)
+        step, x = scipy.linalg.expm(A * times[1]), np.empty((times.size, start.size))
+        x[0] = start
+        for k in range(1, times.size):
+            x[k] = step @ x[k - 1]
+        colour, style = COLOURS[index % len(COLOURS)], ("-", "--", "-.", ":")[index % 4]
+        for i in range(len(joints)):
+            axes[i].plot(times, x[:, i], color=colour, linewidth=1.8, linestyle=style, label=label)
+        axes[-1].plot(times, -(x @ gain.T), color=colour, linewidth=1.8, linestyle=style)
+    for ax, joint in zip(axes, joints, strict=False):
+        ax.set_ylabel(f"{joint.name} [{joint.unit}]")
+    axes[-1].set_ylabel(f"{', '.join(joints[i].name for i in driven)} [{plant.coordinates.drive_unit}]")
+    axes[-1].set_xlabel("time [s]")
+    axes[0].set_title("Released 0.05 off upright (linear model)", loc="left", fontweight="bold")
+    axes[0].legend(frameon=False, fontsize=9, loc="upper right")
+    return figure
+
+
 def phase_portrait_figure(plant: RigidPlant, gain: Gain, effort_limit: float, region: Region) -> Figure:
     """Return the closed loop's phase portrait, with the sampled and the proven region of attraction."""
     figure, (ax,) = _figure(height=5.2)
@@ -266,21 +299,25 @@ def region_to_show(
 
 
 def design_figures(
-    plant: RigidPlant,
+    plant: PlantParameters,
     model: LinearModel,
     rows: Sequence[tuple[str, Gain]],
     chosen: int,
     effort_limit: float,
 ) -> dict[str, Figure]:
-    """Return all figures of a design table by file name; a phase portrait only for a plant with two states."""
+    """Return all figures of a design table by file name.
+
+    Plants of several joints have a release in place of a step, since a passive joint takes no set-point, and with
+    several motors no Bode plot; a phase portrait needs two states.
+    """
     gains = {label: gain.K for label, gain in rows}
     gain = rows[chosen][1]
-    figures = {
-        "pole_map": pole_map_figure(model, gains),
-        "root_locus": root_locus_figure(model, gain.K),
-        "bode": bode_figure(model, gain.K),
-        "step_response": step_figure(model, gains, analyse(model, gain.K)),
-    }
+    figures = {"pole_map": pole_map_figure(model, gains), "root_locus": root_locus_figure(model, gain.K)}
+    if model.B.shape[1] == 1:
+        figures["bode"] = bode_figure(model, gain.K)
+    if not plant.is_pendulum:
+        return {**figures, "release": release_figure(plant, model, gains)}
+    figures["step_response"] = step_figure(model, gains, analyse(model, gain.K))
     # Plane and proof need two states.
     if model.theta == UPRIGHT and not model.hidden:
         region = region_to_show(plant, model, gain, effort_limit)

@@ -21,13 +21,16 @@ from pendulum_msgs_py.json_values import without_nan
 from pendulum_msgs_py.parameters import suggestion
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant_file
 
-__all__ = ["IDENTIFIED", "UNCERTAIN", "ParameterBox", "WorstCase", "parse_box", "worst_case"]
+__all__ = ["IDENTIFIED", "UNCERTAIN", "ParameterBox", "WorstCase", "parse_box", "uncertain_names", "worst_case"]
 
 UNCERTAIN = ("inertia", "damping", "gravity", "angle_offset", "actuator_time_constant", "transport_delay")
-"""Parameters of the linear model that may be uncertain."""
+"""Parameters of one joint's linear model that may be uncertain."""
+_OF_JOINTS = ("damping", "time_constant", "transport_delay")
 IDENTIFIED = "identified"
 """Selects the intervals of the plant file, with the correlations in the identification's JSON file if present."""
 
+_MOST_CORNERED = 8
+"""Most parameters of which all corners of the box are taken; of more as many are drawn."""
 _INSIDE = 48
 """Plants drawn within a box, in addition to its corners, or on an ellipsoid."""
 
@@ -59,7 +62,10 @@ class ParameterBox:
         rng = np.random.default_rng(0)
         low, high = (np.array([pair[i] for pair in self.bounds.values()]) for i in (0, 1))
         if self.correlation is None:
-            corners = np.array(list(itertools.product(*self.bounds.values())))
+            if low.size <= _MOST_CORNERED:
+                corners = np.array(list(itertools.product(*self.bounds.values())))
+            else:
+                corners = np.where(rng.random((2**_MOST_CORNERED, low.size)) < 0.5, low, high)
             values = np.vstack([corners, rng.uniform(low, high, (_INSIDE, low.size))])
         else:
             # Standard errors from 95 % intervals of single parameters; the joint region is larger.
@@ -71,16 +77,17 @@ class ParameterBox:
             # Along each axis too: the ellipsoid extends furthest there, and draws hardly ever hit it.
             ball = np.vstack([ball, np.eye(low.size), -np.eye(low.size)])
             reach = math.sqrt(float(scipy.special.chdtri(low.size, 0.05)))
-            centre = np.array([getattr(plant, name) for name in self.bounds])
+            centre = np.array([plant.value(name) for name in self.bounds])
             values = centre + reach * (ball @ factor.T) * half
         found = [plant]
         for row in values:
             changes = dict(zip(self.bounds, map(float, row), strict=True))
             for name, value in changes.items():
                 if name != "angle_offset":
-                    # Physical bounds; inertia must be positive.
-                    changes[name] = max(value, 1e-3 * plant.inertia if name == "inertia" else 0.0)
-            found.append(plant.with_values(**changes))
+                    # Physical bounds; an inertia must be positive.
+                    least = 1e-3 * plant.value(name) if plant.specs[name].exclusive_minimum else 0.0
+                    changes[name] = max(value, least)
+            found.append(plant.with_values(changes))
         return found
 
 
@@ -105,8 +112,15 @@ class WorstCase:
         return without_nan(asdict(self))
 
 
-def worst_case(plants: Sequence[PlantParameters], K: ArrayLike, theta: float, names: Sequence[str]) -> WorstCase:
-    """Return the worst margins of a gain, shape (2,), over plants linearised at a measured angle [rad].
+def uncertain_names(plant: PlantParameters) -> Sequence[str]:
+    """Return the names of the parameters that may be uncertain: those of the linear model."""
+    if plant.is_pendulum:
+        return UNCERTAIN
+    return [name for name in plant.numbers if "." not in name or name.rpartition(".")[2] in _OF_JOINTS]
+
+
+def worst_case(plants: Sequence[PlantParameters], K: ArrayLike, theta: float | None, names: Sequence[str]) -> WorstCase:
+    """Return the worst margins of a gain (k,) of one motor over plants linearised at an angle [rad], None for upright.
 
     The plants have one structure; ``names`` are the parameters of the worst one to report.
     """
@@ -122,7 +136,7 @@ def worst_case(plants: Sequence[PlantParameters], K: ArrayLike, theta: float, na
         else:
             found.append((margins, plant))
     worst = lost or min(found, key=lambda pair: pair[0].modulus)[1]
-    where = {name: float(getattr(worst, name)) for name in names}
+    where = {name: worst.value(name) for name in names}
     if not found:
         return WorstCase(len(plants), unstable, None, where)
     every = [margins for margins, _ in found]
@@ -160,18 +174,20 @@ def parse_box(texts: Sequence[str], plant: PlantParameters, path: Path | None = 
             raise ParameterError(
                 f"--uncertainty is {IDENTIFIED} and {len(texts) - 1} more; expected {IDENTIFIED} alone"
             )
-        return _identified(path)
+        return _identified(path, uncertain_names(plant))
+    allowed = uncertain_names(plant)
     bounds: dict[str, tuple[float, float]] = {}
     for text in texts:
         name, _, value = text.partition("=")
-        if name not in UNCERTAIN:
-            raise ParameterError(f"--uncertainty names {name!r}; {suggestion(name, (*UNCERTAIN, IDENTIFIED))}")
+        if name not in allowed:
+            raise ParameterError(f"--uncertainty names {name!r}; {suggestion(name, (*allowed, IDENTIFIED))}")
         if name in bounds:
             raise ParameterError(f"--uncertainty names {name} twice; expected each parameter once")
-        bounds[name] = _bounds(text, value, float(getattr(plant, name)))
+        bounds[name] = _bounds(text, value, plant.value(name))
         low, high = bounds[name]
-        if name != "angle_offset" and (low < 0.0 or (name == "inertia" and low <= 0.0)):
-            least = "> 0" if name == "inertia" else ">= 0"
+        positive = plant.specs[name].exclusive_minimum
+        if name != "angle_offset" and (low < 0.0 or (positive and low <= 0.0)):
+            least = "> 0" if positive else ">= 0"
             raise ParameterError(f"--uncertainty {text} reaches from {low:g} to {high:g}; expected values {least}")
     return ParameterBox(bounds)
 
@@ -197,13 +213,13 @@ def _bounds(text: str, value: str, own: float) -> tuple[float, float]:
     return low, high
 
 
-def _identified(path: Path | None) -> ParameterBox:
+def _identified(path: Path | None, allowed: Sequence[str]) -> ParameterBox:
     if path is None:
         raise ParameterError(f"--uncertainty {IDENTIFIED} needs --plant, a plant file that identify wrote")
     intervals = load_plant_file(path)[1].get("intervals", {})
-    bounds = {name: (float(intervals[name][0]), float(intervals[name][1])) for name in UNCERTAIN if name in intervals}
+    bounds = {name: (float(intervals[name][0]), float(intervals[name][1])) for name in allowed if name in intervals}
     if not bounds:
-        raise ParameterError(f"plant file {path} has no interval of {', '.join(UNCERTAIN)}; expected one of identify")
+        raise ParameterError(f"plant file {path} has no interval of {', '.join(allowed)}; expected one of identify")
     correlation = _correlation(path.with_suffix(".json"), tuple(bounds))
     how = "correlated as in the identification" if correlation is not None else "each by itself"
     return ParameterBox(bounds, correlation, f"95 % intervals of {path.name}, {how}")

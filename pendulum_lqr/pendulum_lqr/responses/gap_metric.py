@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = [
     "DEFAULT_SCALING",
@@ -127,6 +128,13 @@ class JointScaling(SignalScaling):
             Bryson and Ho, Applied Optimal Control, 1975, section 5.2 (q = 1 / largest deviation squared).
         """
         return cls(tuple(names), tuple(units), tuple(float(w) ** -0.5 for w in q), float(r) ** -0.5, effort_unit)
+
+    @classmethod
+    def of_plant(cls, plant: PlantParameters, names: Sequence[str]) -> JointScaling:
+        """Return the scaling of a plant's own LQR weights; ``names`` are those of its positions and velocities."""
+        joints = plant.coordinates.joints
+        units = [joint.unit for joint in joints] + [joint.velocity_unit for joint in joints]
+        return cls.of_weights(names, units, *plant.mechanism.weights, plant.coordinates.drive_unit)
 
     @property
     def outputs(self) -> Array:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -94,7 +93,7 @@ def monte_carlo(
 
     folder = out or Path("bags", "runs", "monte_carlo")
     console = make_console(stderr=json_output, highlight=False)
-    settings = settings_of(context, MonteCarlo, one_only={"sobol"})
+    settings = settings_of(context, MonteCarlo)
     if replay >= 0:
         _replay(console, settings, replay, folder)
         return
@@ -102,8 +101,10 @@ def monte_carlo(
     with counted_progress(console, "chunks", settings.chunks, folder) as on_progress:
         connect = partial(cluster_client, scheduler, workers)
         result = run_monte_carlo(folder, settings, connect=connect, on_progress=on_progress)
-    if sobol and settings.nominal.is_pendulum:
-        result["sobol"] = sobol_indices(settings, base=sobol)
+    if sobol:
+        found = sobol_indices(settings, base=sobol)
+        # One joint has one output, as it always had.
+        result["sobol"] = found[0] if settings.nominal.is_pendulum else found
     elapsed = time.monotonic() - started
     if json_output:
         print(json_text(result))
@@ -113,7 +114,7 @@ def monte_carlo(
     console.print(f"({elapsed:.0f} s)")
 
 
-def settings_of(context: typer.Context, kind: type[Study], one_only: Collection[str] = (), **others: Any) -> Study:
+def settings_of(context: typer.Context, kind: type[Study], **others: Any) -> Study:
     """Return the settings that the options of a command make.
 
     Of a plant of several joints those count that were typed: the defaults of the options are those of one joint.
@@ -129,7 +130,7 @@ def settings_of(context: typer.Context, kind: type[Study], one_only: Collection[
 
     given, plant = context.params, context.params["plant"]
     several = is_mechanism(plant)
-    if several and (typed := typed_options(context, kind.ONE_ONLY.union(one_only))):
+    if several and (typed := typed_options(context, kind.ONE_ONLY)):
         raise ParameterError(f"{typed[0]} is for a plant of one joint, and {plant} has several: its own LQR holds it")
     if not several and (typed := typed_options(context, kind.SEVERAL_ONLY)):
         raise ParameterError(f"{typed[0]} is for a plant of several joints, and {plant} has one")
@@ -192,9 +193,10 @@ def _print(console: Console, settings: MonteCarlo, result: dict[str, Any]) -> No
     for row in result["worst"][:5]:
         table.add_row(str(row["run"]), *(format(row[name], formats.get(name, ".4g")) for name in names))
     console.print(table)
-    if "sobol" in result:
-        table = number_table(f"Sobol indices of {result['sobol']['output']}", "factor", "first order", "total", left=0)
-        for entry in result["sobol"]["indices"]:
+    found = result.get("sobol", [])
+    for output in found if isinstance(found, list) else [found]:
+        table = number_table(f"Sobol indices of {output['output']}", "factor", "first order", "total", left=0)
+        for entry in output["indices"]:
             table.add_row(
                 entry["factor"],
                 f"{entry['first']:.4f} ± {entry['first_confidence']:.4f}",

@@ -134,9 +134,7 @@ def analyse_responses(
             by_label = {response.label: response for response in responses}
         _refuse_other_joints(mechanism, responses[0])
         model, (q, r) = linearise(mechanism), mechanism.mechanism.weights
-        joints, effort_unit = mechanism.coordinates.joints, mechanism.coordinates.drive_unit
-        units = [joint.unit for joint in joints] + [joint.velocity_unit for joint in joints]
-        scaling = scaling or JointScaling.of_weights(model.measured, units, q, r, effort_unit)
+        scaling = scaling or JointScaling.of_plant(mechanism, model.measured)
         machine = Machine.relative_to(by_label["hw"], model) if "hw" in by_label else None
         longer = longer or f"python -m pendulum_bags experiment joints --plant {plant} --periods 40"
     else:

@@ -30,7 +30,6 @@ from pendulum_bags.studies.chunks import (
 )
 from pendulum_bags.studies.closed_loops import ClosedLoops, Columns
 from pendulum_bags.studies.uncertain import VARIED
-from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.errors import BagError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_sim.batches.batch import simulate_batch
@@ -243,8 +242,8 @@ def _figures(folder: Path, settings: MonteCarlo) -> dict[str, Any]:
     }
 
 
-def sobol(settings: MonteCarlo, *, base: int = 4096) -> dict[str, Any]:
-    """Return first-order and total Sobol indices of one joint's spread over independent parameters, noise and start.
+def sobol(settings: MonteCarlo, *, base: int = 4096) -> list[dict[str, Any]]:
+    """Return first-order and total Sobol indices of each joint's spread over independent parameters, noise and start.
 
     Args:
         settings: Distributions and loop; ``runs`` is not used.
@@ -256,40 +255,48 @@ def sobol(settings: MonteCarlo, *, base: int = 4096) -> dict[str, Any]:
     from SALib.analyze import sobol as analysis
     from scipy.special import ndtri
 
-    factors = [name for name in VARIED if settings.uncertainty.shares.get(name, 0.0) > 0.0]
-    factors += ["noise"] + (["start"] if settings.start > 0.0 else [])
+    plant, uncertainty, names = settings.nominal, settings.uncertainty, _names(settings.nominal)
+    varied = VARIED if plant.is_pendulum else tuple(uncertainty.shares)
+    factors = [name for name in varied if uncertainty.shares.get(name, 0.0) > 0.0]
+    starts = ["start"] if plant.is_pendulum else list(names.start)
+    factors += ["noise"] + (starts if settings.start > 0.0 else [])
     problem = {"num_vars": len(factors), "names": factors, "bounds": [[0.0, 1.0]] * len(factors)}
     unit = np.clip(_sample(problem, base, settings.seed), 1e-9, 1.0 - 1e-9)
     count = len(unit)
-    plant = settings.nominal
-    normals = np.zeros((len(VARIED), count))
-    for row, name in enumerate(VARIED):
+    normals = np.zeros((len(varied), count))
+    for row, name in enumerate(varied):
         if name in factors:
             normals[row] = ndtri(unit[:, factors.index(name)])
-    drawn: Columns = {**settings.uncertainty.scatter(plant, normals, correlated=False)}
-    start = 2.0 * unit[:, factors.index("start")] - 1.0 if "start" in factors else np.zeros(count)
-    drawn["theta_0"] = UPRIGHT + settings.start * start
+    drawn: Columns = {**uncertainty.scatter(plant, normals, correlated=False)}
+    for name, factor, goal in zip(names.start, starts, plant.coordinates.goal, strict=True):
+        off = 2.0 * unit[:, factors.index(factor)] - 1.0 if factor in factors else np.zeros(count)
+        drawn[name] = goal + settings.start * off
     # The noise as one factor: which of a thousand million signals.
     drawn["noise_seed"] = (unit[:, factors.index("noise")] * 1e9).astype(np.int64)
     columns, _ = _simulate(settings, drawn)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FutureWarning)  # SALib's own use of pandas
-        warnings.simplefilter("ignore", RuntimeWarning)  # what does not vary has no shares: they are NaN
-        found = analysis.analyze(problem, columns["std_theta"], calc_second_order=False, seed=settings.seed)
-    return {
-        "output": "std_theta",
-        "runs": count,
-        "indices": [
+    results = []
+    for output in names.spread:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FutureWarning)  # SALib's own use of pandas
+            warnings.simplefilter("ignore", RuntimeWarning)  # what does not vary has no shares: they are NaN
+            found = analysis.analyze(problem, columns[output], calc_second_order=False, seed=settings.seed)
+        results.append(
             {
-                "factor": name,
-                "first": float(found["S1"][i]),
-                "first_confidence": float(found["S1_conf"][i]),
-                "total": float(found["ST"][i]),
-                "total_confidence": float(found["ST_conf"][i]),
+                "output": output,
+                "runs": count,
+                "indices": [
+                    {
+                        "factor": name,
+                        "first": float(found["S1"][i]),
+                        "first_confidence": float(found["S1_conf"][i]),
+                        "total": float(found["ST"][i]),
+                        "total_confidence": float(found["ST_conf"][i]),
+                    }
+                    for i, name in enumerate(factors)
+                ],
             }
-            for i, name in enumerate(factors)
-        ],
-    }
+        )
+    return results
 
 
 def _sample(problem: dict[str, Any], base: int, seed: int) -> Array:

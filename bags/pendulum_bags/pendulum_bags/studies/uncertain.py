@@ -69,12 +69,7 @@ class Uncertainty:
         self.check(plant)
         if plant.is_pendulum:
             return self.scatter(plant, generator.standard_normal((len(VARIED), count)), correlated=True)
-        drawn = {}
-        for name, share in self.shares.items():
-            # Mean and deviation are those of the value, not of its logarithm.
-            spread = math.sqrt(math.log1p(share**2))
-            drawn[name] = plant.value(name) * np.exp(spread * generator.standard_normal(count) - 0.5 * spread**2)
-        return drawn
+        return self.scatter(plant, generator.standard_normal((len(self.shares), count)), correlated=False)
 
     def variations(self, plant: PlantParameters, drawn: Mapping[str, NDArray[Any]]) -> dict[str, Array]:
         """Return what the batch engine varies: static friction of one joint follows its Coulomb friction."""
@@ -90,18 +85,22 @@ class Uncertainty:
         return found
 
     def scatter(self, plant: PlantParameters, normals: Array, *, correlated: bool) -> dict[str, Array]:
-        """Return pendulums for standard normal numbers, shape (len(VARIED), n): log-normal about the plant's values."""
+        """Return plants for standard normal numbers, shape (k, n): log-normal about the plant's values.
+
+        The k parameters are ``VARIED`` of one joint, else those of ``shares``.
+        """
+        varied = VARIED if plant.is_pendulum else tuple(self.shares)
         factor, variances = self._factor(correlated=correlated)
         logarithms = np.zeros_like(normals)
         names = list(self.shares)
-        rows = [VARIED.index(name) for name in names]
+        rows = [varied.index(name) for name in names]
         for row, weights, variance in zip(rows, factor, variances, strict=True):
             # Sums in a stated order: a matrix product may round otherwise on another machine.
             for weight, source in zip(weights, rows, strict=True):
                 if weight != 0.0:
                     logarithms[row] += weight * normals[source]
             logarithms[row] -= 0.5 * variance
-        return {name: getattr(plant, name) * np.exp(logarithms[row]) for row, name in enumerate(VARIED)}
+        return {name: plant.value(name) * np.exp(logarithms[row]) for row, name in enumerate(varied)}
 
     def _factor(self, *, correlated: bool = True) -> tuple[Array, Array]:
         """Return L with L L' = covariance of the logarithms, and its diagonal."""
