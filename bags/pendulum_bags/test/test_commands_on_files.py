@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from pendulum_bags.commands.frequency_response_cli import main as response_main
 from pendulum_bags.commands.ranking_cli import main as ranking_main
 from pendulum_bags.commands.replay_cli import main as replay_main
 from pendulum_bags.commands.report_cli import main as report_main
+from pendulum_bags.frequency_response.analyse import read_responses
 from pendulum_bags.recordings.reading import Reading
 from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from pendulum_testing.synthetic_runs import regulate
@@ -346,20 +348,26 @@ def test_trials_of_several_joints_cost_what_the_plants_lqr_weighs(tmp_path: Path
     assert "expected --plant, whose LQR weighs them" in ranked(capsys, tmp_path, "--mapping", mapping, code=2)
 
 
-def test_a_disturbance_at_one_joint_is_that_of_all(tmp_path: Path, capsys: Any) -> None:
+def cart_with_pole(path: Path, seed: int, *, late: int = 0, order: Sequence[int] = range(7), flip: int = 0) -> str:
+    """Write a cart on a spring and what hangs from it, under noise; columns in some order, the sign of one turned."""
     t = 0.01 * np.arange(4000)
     noise = np.repeat(np.random.default_rng(0).normal(0.0, 2.0, 400), 10)
-    # A cart on a spring and what hangs from it: place, angle, and their rates.
     a = np.array([[0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0], [-9.0, 0.0, -3.0, 0.0], [9.0, -25.0, 3.0, -4.0]])
     b = np.array([[0.0], [0.0], [1.0], [-1.0]])
-    paths = []
-    for seed, (name, late) in enumerate((("simulation", 0), ("machine", 4))):
-        felt = np.concatenate([np.zeros(late), noise[: noise.size - late]])
-        motion = scipy.signal.lsim((a, b, np.eye(4), np.zeros((4, 1))), felt, t)[1]
-        rows = np.column_stack([t, motion + np.random.default_rng(seed).normal(0.0, 1e-4, motion.shape), noise])
-        paths.append(str(tmp_path / f"{name}.csv"))
-        header = "time,cart_pos,pole_angle,cart_vel,pole_vel,disturbance"
-        np.savetxt(paths[-1], rows, delimiter=",", header=header, comments="")
+    felt = np.concatenate([np.zeros(late), noise[: noise.size - late]])
+    motion = scipy.signal.lsim((a, b, np.eye(4), np.zeros((4, 1))), felt, t)[1]
+    rows = np.column_stack([t, motion + np.random.default_rng(seed).normal(0.0, 1e-4, motion.shape), felt, noise])
+    if flip:
+        rows[:, [flip, flip + 2]] *= -1.0
+    names = ["time", "cart_pos", "pole_angle", "cart_vel", "pole_vel", "cart_force [N]", "disturbance"]
+    header = ",".join(names[place] for place in order)
+    np.savetxt(path, rows[:, list(order)], delimiter=",", header=header, comments="")
+    return str(path)
+
+
+def test_a_disturbance_at_one_joint_is_that_of_all(tmp_path: Path, capsys: Any) -> None:
+    order = (0, 1, 2, 3, 4, 6)
+    paths = [cart_with_pole(tmp_path / f"{i}.csv", i, late=late, order=order) for i, late in enumerate((0, 4))]
     assert compare_main([*paths, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["answer"]["mark"] == "no"
@@ -368,3 +376,20 @@ def test_a_disturbance_at_one_joint_is_that_of_all(tmp_path: Path, capsys: Any) 
         if test["quantity"] == "delay"
     ]  # fmt: skip
     assert delays == [pytest.approx(40.0, abs=2.0)] * 2
+
+
+def test_joints_in_another_order_are_the_same_and_an_opposite_sign_names_its_joint(tmp_path: Path, capsys: Any) -> None:
+    plain, other = cart_with_pole(tmp_path / "a.csv", 0), (0, 2, 1, 4, 3, 5, 6)
+    turned = cart_with_pole(tmp_path / "b.csv", 1, order=other)
+    (ours, theirs), _, _ = read_responses([Path(plain), Path(turned)])
+    assert (ours.joints, theirs.joints) == (("cart", "pole_angle"),) * 2
+    (same,), _, _ = read_responses([Path(cart_with_pole(tmp_path / "c.csv", 1))])
+    np.testing.assert_allclose(theirs.response, same.response, rtol=1e-9)
+    assert read_responses([Path(plain)], ("pole_angle", "cart"))[0][0].joints == ("pole_angle", "cart")
+    assert compare_main([plain, cart_with_pole(tmp_path / "d.csv", 1, flip=2)]) == 2
+    assert "the hardware's angle of pole_angle in" in " ".join(capsys.readouterr().err.split())
+    assert compare_main([plain, "--start", "50"]) == 2
+    assert f"got {plain}; expected recordings" in " ".join(capsys.readouterr().err.split())
+    assert compare_main([plain, turned, "--start", "50"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "has 0 samples from 50 s after its start, and ends at 39.99 s; expected at least 4" in said

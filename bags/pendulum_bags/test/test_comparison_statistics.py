@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pandas as pd
 import pytest
 from scipy import signal, stats
 
-from pendulum_bags.comparison.statistics import Interval, Jackknife, describe, kolmogorov_smirnov
+from pendulum_bags.comparison.statistics import Interval, Jackknife, describe, exponential, kolmogorov_smirnov
 from pendulum_bags.runs.correlation import effective_size
 from pendulum_msgs_py.errors import DataError
 
@@ -64,6 +66,11 @@ def interval_of_mean(runs: list[np.ndarray], *, runs_differ: bool) -> Interval:
     if runs_differ:
         found = found.of_runs(np.array([run.mean() for run in runs]), [run.size for run in runs])
     return found.interval(0.9)
+
+
+def test_the_interval_of_a_ratio_that_is_not_determined_has_no_upper_end() -> None:
+    interval = Jackknife(0.0, 1000.0, 2.0, 3).interval(0.95, exponential)
+    assert (interval.estimate, interval.low, interval.high) == (1.0, 0.0, math.inf)
 
 
 def test_interval_of_a_mean_covers_the_truth_as_often_as_stated_in_spite_of_correlation() -> None:

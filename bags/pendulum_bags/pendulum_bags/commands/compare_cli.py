@@ -147,7 +147,7 @@ def compare(
             joints = shared_joints(readings, (sim_prefix, hw_prefix), open_bag=bags)
         else:
             raise DataError(
-                f"got {len(paths)} paths ({', '.join(map(str, paths))}); "
+                f"got {', '.join(map(str, paths)) or 'no path'}; "
                 "expected recordings of a simulation and of hardware, or run folders that hold sim and hw"
             )
         sources = [*(paths if len(paths) == 1 else ()), *(layers or ())]

@@ -90,12 +90,14 @@ def frequency_response(
     """
     from pendulum_bags.frequency_response.analyse import analyse_responses, read_responses
     from pendulum_lqr.responses.gap_metric import Scaling
+    from pendulum_msgs_py.plants.plant_parameters import is_mechanism, load_mechanism
 
     scaling = Scaling(angle, velocity, torque)
     readings = readings_of(bags, mapping, topic, dt, start, stop)
     console = make_console(stderr=json_output, highlight=False)
     context.call_on_close(partial(show_guesses, console, readings, write_mapping))
-    responses, recorded, ran = read_responses(readings)
+    joints = load_mechanism(plant).coordinates.names if plant and is_mechanism(plant) else ()
+    responses, recorded, ran = read_responses(readings, joints)
     if not plant and any(reading.was_mapped for reading in readings):
         named = next(reading for reading in readings if reading.was_mapped)
         raise ParameterError(f"{named} does not name its plant; expected --plant, on which designs are made")

@@ -28,7 +28,7 @@ from pendulum_bags.comparison.operating_band import Band
 from pendulum_bags.comparison.pairs import Pair, interpolated_difference
 from pendulum_bags.comparison.same_run import Looks
 from pendulum_bags.comparison.same_signal import AMPLITUDE, compare_signals
-from pendulum_bags.comparison.statistics import Interval, rms
+from pendulum_bags.comparison.statistics import Interval, exponential, rms
 from pendulum_bags.distributions import student_quantile
 from pendulum_bags.runs.run_data import OpenBag, RunData, read_run
 from pendulum_bags.runs.series import Series, Signal, uniform_times
@@ -221,19 +221,20 @@ def find_shared(simulation: Sequence[RunData], hardware: Sequence[RunData]) -> S
     for kind, signal in _SIGNALS.items():
         for ours, theirs in joints:
             one, other = signal(ours), signal(theirs)
+            at = f" at {ours.joint}" if len(joints) > 1 else ""
             if one is None or other is None or not np.any(one.value) or not np.any(other.value):
                 continue
             shift, correlation = _best_shift([(one, other)], ours, theirs)
             moved = Signal(other.t + shift, other.value, other.name)
             period = min(ours.window.period, theirs.window.period)
-            if not (reason := _unlike(kind, one, moved, correlation, period)):
+            if not (reason := _unlike(f"{kind}s of both{at}", kind, one, moved, correlation, period)):
                 return Shared(kind, shift, correlation, signals=(one, moved))
             turned = Signal(other.t, -other.value, other.name)
             if (opposite := _best_shift([(one, turned)], ours, theirs)[1]) > _ALIKE:
                 reason = (
-                    f"the {kind}s of both have opposite signs (correlation {-opposite:.2f}): where that is a matter of "
-                    f"the column, write the guess with --write-mapping, set `sign: -1` for the {kind} of one, and give "
-                    "it as --mapping"
+                    f"the {kind}s of both{at} have opposite signs (correlation {-opposite:.2f}): where that is a "
+                    f"matter of the column, write the guess with --write-mapping, set `sign: -1` for the {kind} of "
+                    "one, and give it as --mapping"
                 )
             reasons.append(reason)
     free = not any(run.applied is not None and np.any(run.applied.value) for run in (*simulation, *hardware))
@@ -256,19 +257,19 @@ def find_shared(simulation: Sequence[RunData], hardware: Sequence[RunData]) -> S
     return Shared("", 0.0, 0.0, "; ".join(dict.fromkeys(reasons)))
 
 
-def _unlike(kind: str, ours: Signal, theirs: Signal, correlation: float, period: float) -> str:
+def _unlike(what: str, kind: str, ours: Signal, theirs: Signal, correlation: float, period: float) -> str:
     """Return why two signals on one clock differ, as text; empty where they agree."""
     if kind == _DISTURBANCE:
         found = compare_signals(ours, theirs, period)
         return "the disturbances are too short to be compared" if found is None else found.reason
     if correlation <= _ALIKE:
-        return f"the {kind}s of both differ: their correlation is {correlation:.2f} at best, expected above {_ALIKE:g}"
+        return f"the {what} differ: their correlation is {correlation:.2f} at best, expected above {_ALIKE:g}"
     start, stop = max(ours.t[0], theirs.t[0]), min(ours.t[-1], theirs.t[-1])
     at = np.linspace(start, stop, 2000) if stop > start else np.array([start])
     size = rms(theirs.held_at(at)) / max(rms(ours.held_at(at)), 1e-300)
     if not 1.0 / AMPLITUDE <= size <= AMPLITUDE:
         return (
-            f"the {kind}s of both differ in size: the hardware's is {size:.3g} times the simulation's, expected "
+            f"the {what} differ in size: the hardware's is {size:.3g} times the simulation's, expected "
             f"{1.0 / AMPLITUDE:.2f} to {AMPLITUDE:.2f}"
         )
     return ""
@@ -407,19 +408,20 @@ def _check_guesses(simulation: RunData, hardware: RunData, shared: Shared) -> No
     if not (simulation.guessed or hardware.guessed) or a.slides or b.slides:
         return
     how = "write the guess with --write-mapping, correct"
+    angle = f"angle of {hardware.joint} in" if hardware.joint else "angle of"
     ends = f"and give it as --mapping; unchanged, where {Path(hardware.source).name} is really so"
     ratio = float(b.position.std()) / max(float(a.position.std()), 1e-300)
     for factor, degrees in ((180.0 / math.pi, hardware), (math.pi / 180.0, simulation)):
         if abs(math.log(max(ratio, 1e-300) / factor)) < _NEAR_DEGREES:
             raise DataError(
-                f"the hardware's angle of {hardware.source} moves {ratio:.3g} times as much as the simulation's of "
+                f"the hardware's {angle} {hardware.source} moves {ratio:.3g} times as much as the simulation's of "
                 f"{simulation.source}, as degrees taken for radians would; expected one unit: {how} the units of "
                 f"{Path(degrees.source).name} to deg and deg/s, {ends}"
             )
     apart = float(b.position.mean() - a.position.mean())
     if shared.kind and math.cos(apart) < -math.cos(_NEAR_HALF_TURN):
         raise DataError(
-            f"the hardware's mean angle of {hardware.source} is {apart:.4g} rad from the simulation's of "
+            f"the hardware's mean {angle} {hardware.source} is {apart:.4g} rad from the simulation's of "
             f"{simulation.source}, as an angle that is 0 upright on one side would be; expected one zero: {how} the "
             f"offset of one position to 3.14159 (180 in deg), {ends}"
         )
@@ -428,7 +430,7 @@ def _check_guesses(simulation: RunData, hardware: RunData, shared: Shared) -> No
         like = float(np.corrcoef(motions.simulation.velocity, motions.hardware.velocity)[0, 1])
         if like < -_OPPOSITE:
             raise DataError(
-                f"the hardware's angle of {hardware.source} moves against the simulation's of {simulation.source} "
+                f"the hardware's {angle} {hardware.source} moves against the simulation's of {simulation.source} "
                 f"(correlation {like:.2f}), as one of the opposite sign would; expected one sign: {how} the sign of "
                 f"one position and its velocity to -1, {ends}"
             )
@@ -499,7 +501,7 @@ def _of_runs(
     looks = Looks()
     runs = np.array(values)
     error = float(runs.std(ddof=1)) / math.sqrt(runs.size)
-    scale: Callable[[float], float] = math.exp if ratio else lambda value: value * margin.per_si
+    scale: Callable[[float], float] = exponential if ratio else lambda value: value * margin.per_si
 
     def interval(level: float) -> Interval:
         reach = float(student_quantile(0.5 + 0.5 * level, runs.size - 1)) * error

@@ -25,7 +25,7 @@ from pendulum_bags.comparison.band import SlowClock, common_band
 from pendulum_bags.comparison.equivalence import EquivalenceTest, Outcome, equivalence_test
 from pendulum_bags.comparison.long_run import Disturbance, covariance, moments
 from pendulum_bags.comparison.margins import Margin, Margins
-from pendulum_bags.comparison.statistics import Interval, Jackknife
+from pendulum_bags.comparison.statistics import Interval, Jackknife, exponential
 from pendulum_bags.runs.series import Series, uniform_times
 from pendulum_msgs_py.errors import ParameterError
 
@@ -475,7 +475,7 @@ def _spread_tests(
         if margin.is_share:
             top = 1.0 + margin.si
             name = f"spread of {kind.name(what)} (ratio)"
-            tests.append(_test(found, name, "-", (1.0 / top, top), kind, math.exp, ratio=True, beside=beside))
+            tests.append(_test(found, name, "-", (1.0 / top, top), kind, exponential, ratio=True, beside=beside))
         else:
             tests.append(_within(found, f"spread of {kind.name(what)} difference", margin, kind, beside))
     return tests

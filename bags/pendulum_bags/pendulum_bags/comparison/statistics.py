@@ -15,7 +15,16 @@ from pendulum_bags.distributions import kolmogorov_tail, student_quantile
 from pendulum_bags.runs.correlation import autocorrelation, effective_size
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["Interval", "Jackknife", "KolmogorovSmirnov", "describe", "kolmogorov_smirnov", "quantile_pairs", "rms"]
+__all__ = [
+    "Interval",
+    "Jackknife",
+    "KolmogorovSmirnov",
+    "describe",
+    "exponential",
+    "kolmogorov_smirnov",
+    "quantile_pairs",
+    "rms",
+]
 
 
 def describe(values: ArrayLike) -> dict[str, float]:
@@ -116,7 +125,7 @@ class Jackknife:
         return Jackknife(self.estimate - other.estimate, math.sqrt(total), freedom, blocks, between)
 
     def interval(self, level: float, scale: Callable[[float], float] = float, *, beside: float = 0.0) -> Interval:
-        """Return the interval by Student's t; ``scale`` maps estimate and ends to what is reported (``math.exp``)."""
+        """Return the interval by Student's t; ``scale`` maps estimate and ends to what is reported."""
         reach = float(student_quantile(0.5 + 0.5 * level, self.freedom)) * self.error
         if self.between:
             # Phases are uniform and their effects skewed, of which Student's t misses up to four times what it states.
@@ -124,6 +133,11 @@ class Jackknife:
             reach = max(reach, float(student_quantile(1.0 - 0.25 * tail, runs.freedom)) * runs.error)
         estimate, low, high = (scale(self.estimate + side * (reach + beside)) for side in (0.0, -1.0, 1.0))
         return Interval(estimate, low, high, level, self.error, self.blocks)
+
+
+def exponential(value: float) -> float:
+    """Return e**value, infinity where that is too large for a number."""
+    return math.exp(value) if value < 709.0 else math.inf
 
 
 class KolmogorovSmirnov(NamedTuple):

@@ -40,11 +40,13 @@ NUMBERS = "frequency_response.json"
 """Results, in a run folder."""
 
 
-def read_responses(paths: Sequence[Path | Reading]) -> tuple[list[MeasuredResponse], str, list[str]]:
+def read_responses(
+    paths: Sequence[Path | Reading], names: Sequence[str] = ()
+) -> tuple[list[MeasuredResponse], str, list[str]]:
     """Return the responses of one or two recordings or of a folder with ``sim`` and ``hw``, and the designs' plant.
 
-    The simulation comes first. A BagError if a bag cannot be read, a DataError if it holds no excited plant or both are
-    of one side.
+    The simulation comes first; joints go in the order of ``names`` or of the first recording. A BagError if a bag
+    cannot be read, a DataError if it holds no excited plant or both are of one side.
     """
     readings = [Reading.of(path) for path in paths]
     if len(readings) == 1 and all((readings[0].path / side).is_dir() for side in ("sim", "hw")):
@@ -53,11 +55,11 @@ def read_responses(paths: Sequence[Path | Reading]) -> tuple[list[MeasuredRespon
         raise DataError(
             f"got {len(readings)} recordings; expected one, those of simulation and hardware, or a run folder"
         )
-    found = []
+    found: list[MeasuredResponse] = []
     plant = "thesis"
     policies: dict[str, None] = {}
     for i, reading in enumerate(readings):
-        record, facts = _read(reading)
+        record, facts = _read(reading, found[0].joints if found else names)
         side = str(facts.get("side") or str(facts.get("namespace", "")).strip("/"))
         label = side if side in {"sim", "hw"} else ("hw" if len(readings) == 1 or i else "sim")
         plant = _design_plant(reading.path, facts) or plant
@@ -71,12 +73,13 @@ def read_responses(paths: Sequence[Path | Reading]) -> tuple[list[MeasuredRespon
     return sorted(found, key=lambda response: response.label, reverse=True), plant, list(policies)
 
 
-def _read(path: Reading) -> tuple[Record, Mapping[str, Any]]:
+def _read(path: Reading, names: Sequence[str]) -> tuple[Record, Mapping[str, Any]]:
     from pendulum_bags.runs.cached_bags import CachedBags
     from pendulum_bags.runs.run_data import joints_of, read_run
 
     with CachedBags() as bags:
         joints = joints_of(path, open_bag=bags)
+        joints = tuple(names) if sorted(names) == sorted(joints) else joints
         if not joints:
             run = read_run(path, or_all=not path.is_bag, open_bag=bags)
             return record_of_run(run), run_record(run.metadata)
