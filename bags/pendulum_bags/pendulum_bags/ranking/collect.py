@@ -33,15 +33,9 @@ _FALLEN = 0.5
 
 
 def cost_parts(metrics: Mapping[str, float | None], duration: float, weights: Sequence[float] = WEIGHTS) -> Array:
-    """Return the parts of the mean cost of a run, shape (3,).
+    """Return the parts of the mean cost of a run of a duration [s], shape (3,), by weights q11, q22 and r.
 
-    Args:
-        metrics: Of :mod:`pendulum_bags.comparison.metrics`: ``ise``, ``rms_velocity`` and ``effort_energy``.
-        duration: Length of the run [s].
-        weights: q11, q22 and r.
-
-    Raises:
-        DataError: One of them is no finite number.
+    ``metrics`` has ``ise``, ``rms_velocity`` and ``effort_energy``. A DataError if a part is no finite number.
     """
     ise, velocity, energy = (metrics[name] for name in ("ise", "rms_velocity", "effort_energy"))
     if ise is None or velocity is None or energy is None:
@@ -190,9 +184,7 @@ def _parts(metrics: Mapping[str, float | None], duration: float, weights: Sequen
 def _recorded_run(bag: Path, weights: Sequence[float]) -> _Run | None:
     """Return the run that a bag holds, None for a sound one that names no controller and side.
 
-    Raises:
-        BagError: The bag cannot be read.
-        DataError: It is damaged, or its run is not whole.
+    A BagError or a DataError if it cannot be read, is damaged, or its run is not whole.
     """
     with read_bag(bag) as opened:
         facts, damage = run_record(opened.metadata), list(opened.damage)

@@ -69,9 +69,8 @@ def contenders_of(
 ) -> list[Contender]:
     """Return the contenders that have runs on both sides.
 
-    Args:
-        costs: Name -> side (``sim``, ``hw``) -> (seed, parts of the cost, or None for a run that failed).
-        real: Names that have runs on real hardware.
+    ``costs``: name -> side (``sim``, ``hw``) -> (seed, parts of the cost, None for a failed run); ``real``: names with
+    runs on real hardware.
     """
     found = []
     for name, sides in costs.items():
@@ -109,11 +108,7 @@ def with_noise_of_their_own(contenders: Sequence[Contender]) -> tuple[Sequence[C
 
 
 def refuse_no_number(contenders: Sequence[Contender]) -> None:
-    """Refuse costs that are no finite number: one would pass for a controller that failed.
-
-    Raises:
-        DataError: There is one; the sentence names contender, side and seed.
-    """
+    """Refuse costs that are no finite number, by a DataError: one would pass for a controller that failed."""
     for one in contenders:
         for side, rows, seeds in (("sim", one.sim, one.sim_seeds), ("hw", one.hw, one.hw_seeds)):
             for i, row in enumerate(rows):

@@ -36,14 +36,9 @@ LEAST_PAIRS = 5
 
 @dataclass(frozen=True)
 class Narrowed:
-    """A mean cost on the hardware without and with the simulated runs.
+    """A mean cost on hardware from n pairs alone (Student's t), and together with N further simulated runs.
 
-    Attributes:
-        alone: From the paired hardware runs alone, with Student's t.
-        together: With the simulated runs.
-        pairs: Number n of pairs.
-        further: Number N of further simulated runs.
-        correlation: Of the pairs.
+    ``correlation`` is that of the pairs.
     """
 
     alone: Interval
@@ -64,15 +59,10 @@ class Narrowed:
 
 
 def narrow(hardware: ArrayLike, simulation: ArrayLike, further: ArrayLike) -> Narrowed:
-    """Return the mean on the hardware with its 95 % interval, without and with simulated runs.
+    """Return the mean cost on hardware with its 95 % interval, without and with simulated runs.
 
-    Args:
-        hardware: Costs of n runs, shape (n,).
-        simulation: Costs of the simulated runs under the same seeds, shape (n,).
-        further: Costs of simulated runs under other seeds, shape (N,).
-
-    Raises:
-        DataError: There are too few pairs, or no further runs.
+    ``hardware`` and ``simulation`` are costs under the same seeds, shape (n,), ``further`` under others, shape (N,). A
+    DataError if there are too few pairs, or no further runs.
     """
     h, s, more = (np.asarray(one, dtype=np.float64) for one in (hardware, simulation, further))
     n = h.size

@@ -20,16 +20,9 @@ COST = "Cost: mean of x' Q x + u' R u with the weights of the plant's own LQR, w
 
 
 def joint_cost_parts(place: Path, spec: RunSpec) -> Array | None:
-    """Return the parts of the mean cost of a run, shape (3,): positions, velocities and the controller's efforts.
+    """Return the parts of the mean cost of a run in a folder, shape (3,); None where the plant fell.
 
     The weights are those of the plant's own LQR, whatever ran: one measure for all controllers.
-
-    Args:
-        place: Folder of the run, with ``bag`` or ``run.npz``.
-        spec: The run.
-
-    Returns:
-        None where the plant fell.
     """
     plant = load_mechanism(spec.design_plant)
     if (place / "run.npz").is_file():
@@ -47,14 +40,9 @@ def joint_cost_parts(place: Path, spec: RunSpec) -> Array | None:
 def cost_of_motion(
     plant: PlantParameters, stamps: NDArray[np.int64], position: Array, velocity: Array, effort: Array
 ) -> Array | None:
-    """Return the parts of the mean cost of a motion, shape (3,); None where the plant fell.
+    """Return the parts of the mean cost of a motion, shape (3,), by the plant's LQR; None where the plant fell.
 
-    Args:
-        plant: Whose LQR weighs.
-        stamps: Shape (s,) [ns].
-        position: Of its n joints, shape (s, n) [rad or m].
-        velocity: Likewise [rad/s or m/s].
-        effort: Of the motors, shape (e, m) [N m or N].
+    Stamps have shape (s,) [ns], position and velocity (s, n) [rad or m, /s], effort of the motors (e, m) [N m or N].
     """
     if fall_time(plant, stamps, position) is not None:
         return None

@@ -43,10 +43,8 @@ _UNKNOWN_SEEDS = (
 class Words:
     """What a ranking is called by, which depends on how its runs were made.
 
-    Attributes:
-        more: What records more.
-        in_frequency: The experiment that compares the plants in frequency; empty where that was done.
-        cost: What the cost is, as a sentence.
+    ``more`` records more; ``in_frequency`` compares the plants in frequency, empty where that was done; ``cost`` is a
+    sentence.
     """
 
     more: str = "record more seeds: --seeds 10"
@@ -58,11 +56,6 @@ def same_choice(ranking: Ranking, words: Words = Words(), case: Case = UNKNOWN) 
     """Return layer 4: yes where the regret is small, no where large, undecided where its runs scatter or are few.
 
     A pick that fails on the hardware in any run is a no, whatever it costs.
-
-    Args:
-        ranking: The ranking.
-        words: How its runs were made.
-        case: The plants that ran.
     """
     regret = ranking.regret_share
     share = [regret.value, regret.low, regret.high]
@@ -249,17 +242,7 @@ def write_ranking(
     emulated: bool = False,
     case: Case = UNKNOWN,
 ) -> Path:
-    """Write numbers, layer, figure and page into a folder; return the page.
-
-    Args:
-        folder: Where to.
-        ranking: The ranking.
-        formats: Of the figure.
-        words: How its runs were made.
-        notes: Sentences at the end of the page.
-        emulated: Whether the hardware was emulated; figure and page name it so then.
-        case: The plants that ran.
-    """
+    """Write numbers, layer, figure and page, with notes at its end, into a folder; return the page."""
     folder.mkdir(parents=True, exist_ok=True)
     layer = name_in(same_choice(ranking, words, case), emulated=emulated)
     write_json(folder / "ranking.json", ranking.to_json())

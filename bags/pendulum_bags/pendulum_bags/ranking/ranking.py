@@ -147,15 +147,10 @@ def _mmrv(sim: Array, hw: Array) -> Array:
 def rank(
     contenders: Sequence[Contender], generator: np.random.Generator | None = None, *, of_scores: bool = False
 ) -> Ranking:
-    """Return a simulation's ranking of contenders, judged by the hardware's.
+    """Return a simulation's ranking of at least three contenders, judged by the hardware's.
 
-    Args:
-        contenders: At least three, with runs on both sides.
-        generator: Of the bootstrap.
-        of_scores: Whether the costs are negatives of scores.
-
-    Raises:
-        DataError: There are too few, fewer than two succeed on both sides, or a cost is no finite number.
+    ``of_scores``: costs are negatives of scores. A DataError if there are too few, under two succeed on both sides,
+    or a cost is no finite number.
     """
     if len(contenders) < _LEAST:
         raise DataError(f"got {len(contenders)} controllers with runs on both sides; expected at least {_LEAST}")

@@ -44,10 +44,7 @@ _SECONDS = {"nanoseconds": 1e-9, "microseconds": 1e-6, "milliseconds": 1e-3, "mi
 def read_numpy(path: Path, part: int = 0) -> Columns:
     """Return the arrays of an ``.npz`` or ``.npy`` file, or of all ``.npy`` files of a folder, as columns.
 
-    Arrays that stand in files of their own beside the one that was named belong to it where they are as long.
-
-    Raises:
-        DataError: There is no array of numbers.
+    Arrays in files of their own beside the named one belong to it if they are as long. A DataError if there is none.
     """
     files = {path: ""} if path.suffix == ".npz" else {}
     if not files:
@@ -119,11 +116,7 @@ def _take(
 
 
 def read_matlab(path: Path, part: int = 0) -> Columns:
-    """Return the variables of a MATLAB file as columns.
-
-    Raises:
-        DataError: It is no such file, or has no array of numbers.
-    """
+    """Return the variables of a MATLAB file as columns; a DataError if it is none or has no array of numbers."""
     try:
         with path.open("rb") as file:
             head = file.read(128)
@@ -158,15 +151,9 @@ def read_matlab(path: Path, part: int = 0) -> Columns:
 
 
 class _Node:
-    """A value of a MATLAB file, of either version.
+    """A value of a MATLAB file: numbers (``shape``, ``read`` by an index), a struct, a list, or an object.
 
-    Attributes:
-        shape: Of an array of numbers; empty of other things.
-        read: Returns those of the numbers that an index of NumPy chooses.
-        by_rows: Whether it does so without reading the others.
-        fields: Of a struct.
-        entries: Of a cell, or of an array of structs.
-        opaque: Whether it is an object.
+    ``by_rows``: ``read`` does not read the rest of the array.
     """
 
     def __init__(

@@ -32,14 +32,9 @@ Messages = Sequence[tuple[int, Any]]
 
 
 def read_bag_columns(path: Path) -> Columns:
-    """Return the numbers of a bag as columns.
+    """Return the numbers of a rosbag2 folder or file, or of a ``.bag`` of ROS 1, as columns.
 
-    Args:
-        path: A rosbag2 folder or file, or a ``.bag`` file of ROS 1.
-
-    Raises:
-        BagError: It cannot be read.
-        DataError: No topic has numbers.
+    A BagError if it cannot be read, a DataError if no topic has numbers.
     """
     source: _Source = _Ros1(path) if is_ros1(path) else _Rosbag2(path)
     columns: dict[str, Column] = {}
@@ -66,12 +61,7 @@ def read_bag_columns(path: Path) -> Columns:
 
 
 class _Source:
-    """The messages of a bag.
-
-    Attributes:
-        topics: Number of messages, by topic.
-        notes: What reading has found out.
-    """
+    """The messages of a bag: ``topics`` has their number, ``notes`` what reading has found out."""
 
     topics: Mapping[str, int]
     notes: list[str]

@@ -14,12 +14,9 @@ __all__ = ["last_words", "run_bridge_program"]
 def run_bridge_program(
     *arguments: str, timeout: float, deaf_to_ctrl_c: bool = False
 ) -> subprocess.CompletedProcess[str]:
-    """Run ``python -m pendulum_hw_bridge`` and return its code and what it printed.
+    """Run ``python -m pendulum_hw_bridge`` with arguments; return its code and what it printed.
 
-    Args:
-        arguments: Of its command line.
-        timeout: When it is ended [s]; then subprocess.TimeoutExpired is raised.
-        deaf_to_ctrl_c: Whether it completes whatever happens to this process or its terminal.
+    After ``timeout`` [s] subprocess.TimeoutExpired is raised. ``deaf_to_ctrl_c``: it outlives this process.
     """
     return subprocess.run(
         [sys.executable, "-m", "pendulum_hw_bridge", *arguments],

@@ -47,13 +47,10 @@ class Column:
 
 @dataclass
 class Columns:
-    """A recording.
+    """A recording: ``columns`` by name, in the order of the file, and ``notes`` of reading it, one sentence each.
 
     Attributes:
-        path: The file or folder.
         kind: Its format, for messages.
-        columns: By name, in the order of the file.
-        notes: What reading has found out, one sentence each.
         period: Sampling period that the file states [s].
         is_table: Whether the values in one row were measured together.
         named: Whether the columns have names that an author gave.
@@ -81,11 +78,7 @@ class Columns:
         self._values.clear()
 
     def stretch(self, rows: int) -> Columns:
-        """Return the middle of a long recording.
-
-        Args:
-            rows: Of its longest column; the others are cut in proportion.
-        """
+        """Return the middle of a long recording: so many rows of its longest column, the others in proportion."""
         share = rows / max(column.size for column in self.columns.values())
         if share >= 1.0:
             return self
@@ -125,13 +118,9 @@ def part_of(path: str | Path) -> tuple[Path, int]:
 def columns_of_array(
     name: str, shape: Sequence[int], read: Callable[[tuple[int | slice, ...]], Any], *, by_rows: bool = False
 ) -> list[Column]:
-    """Return an array of one or two dimensions as columns; the longer side is time.
+    """Return an array of one or two dimensions as columns; the longer side is time, sides of length 1 do not count.
 
-    Args:
-        name: Of the array.
-        shape: Its shape; sides of length 1 do not count.
-        read: Returns what an index of NumPy, of as many entries as the shape, chooses.
-        by_rows: Whether the file is read by rows; else the whole array is read for each of them.
+    ``read`` returns what an index of NumPy chooses; without ``by_rows`` it reads the whole array each time.
     """
     sides = [axis for axis, size in enumerate(shape) if size != 1]
     if len(sides) not in {1, 2}:
@@ -154,12 +143,9 @@ def columns_of_array(
 def grouped_parts(
     arrays: Mapping[str, Sequence[Sequence[Column]]],
 ) -> list[tuple[str, list[Column]]]:
-    """Return the recordings of a file whose arrays stand in lists, one entry for each recording.
+    """Return the recordings of a file whose arrays are lists (name -> columns of each entry), an entry a recording.
 
     Lists belong together where they have as many entries, of the same lengths.
-
-    Args:
-        arrays: Name of a list -> columns of each entry.
     """
     groups: dict[tuple[int, ...], list[str]] = {}
     for name, entries in arrays.items():
@@ -174,11 +160,6 @@ def grouped_parts(
 
 
 def need(error: ImportError, what: str) -> DataError:
-    """Return the error of a file whose library is missing.
-
-    Args:
-        error: What the import raised.
-        what: The file.
-    """
+    """Return the error of a file (``what``) whose library is missing."""
     reason = how_to_install(error) or f"{error.name or 'a library'} cannot be imported: {str(error).splitlines()[0]}"
     return DataError(f"{what} cannot be read: {reason}")

@@ -22,10 +22,9 @@ EFFORTS = {"applied": names.APPLIED_EFFORT, "commanded": names.EFFORT_COMMAND, "
 
 
 def find_prefix(bag: Bag, prefix: str | None = None) -> str:
-    """Return a namespace, by default that of the one plant of a bag, such as ``/sim``; empty for ``/joint_states``.
+    """Return a namespace such as ``/sim``, by default that of the one plant of a bag; empty for ``/joint_states``.
 
-    Raises:
-        DataError: The bag has no plant, or several and no namespace is given.
+    A DataError if the bag has no plant, or several and no namespace is given.
     """
     if prefix is not None:
         return f"/{prefix.strip('/')}".rstrip("/")

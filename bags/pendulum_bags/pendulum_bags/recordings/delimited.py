@@ -33,15 +33,7 @@ _UNIT_IN_COMMENT = re.compile(r"^[#%]\s*([^:]+?)\s*:\s*(\S.*?)\s*$")
 
 @dataclass(frozen=True)
 class _Layout:
-    """Where the rows begin, and what stands above them.
-
-    Attributes:
-        delimiter: Between two cells.
-        first: Index of the first row among the lines.
-        names: Of the columns; none where no line has them.
-        units: By name.
-        cells: Number of cells in a row.
-    """
+    """Where the rows begin (index ``first`` among the lines), their cells, and the names and units above them."""
 
     delimiter: str
     first: int
@@ -51,15 +43,9 @@ class _Layout:
 
 
 def read_delimited(path: Path, *, delimiter: str = "", skip: int = 0) -> Columns:
-    """Return the columns of a text file.
+    """Return the columns of a text file; the delimiter is by default the one by which most cells are numbers.
 
-    Args:
-        path: The file.
-        delimiter: One character; by default the one by which most cells are numbers.
-        skip: Lines to leave out at the beginning.
-
-    Raises:
-        DataError: It is no text, has no row of numbers, or a row of another length.
+    A DataError if it is no text, has no row of numbers, or a row of another length.
     """
     text, notes = _text_of(path)
     lines = text.split("\n")

@@ -88,14 +88,9 @@ _ASSUMED_PLACE = "m: assumed, for the file does not say"
 
 @dataclass(frozen=True)
 class Guess:
-    """One row of what was guessed.
+    """One row of what was guessed: quantity (``position of elbow``), column, unit, and how it was found.
 
-    Attributes:
-        quantity: What it is, such as ``position of elbow``.
-        column: Its column.
-        unit: Its unit.
-        how: By what it was found, and what tests say.
-        assumed: Whether something of it is shown by no test.
+    ``assumed``: no test shows some of it.
     """
 
     quantity: str
@@ -151,9 +146,8 @@ def guess_rules(
 
     Args:
         columns: The recording.
-        period: Sampling period, where the caller knows it [s].
-        only: Role (``position``, ``velocity``, ``input``, ``reference``, ``disturbance``, ``time``, or ``states`` for
-                        first two) -> column, topic or beginning of a path that it is taken from.
+        period: Sampling period, if the caller knows it [s].
+        only: Role (``position``, ..., or ``states`` for the first two) -> column, topic or beginning of a path to take.
 
     Raises:
         DataError: No time, no position, or more than one way to read the file.
@@ -365,8 +359,7 @@ class _Guesser:
     def _joints_by_data(self, still: str) -> list[_Found]:
         """Return the joints of columns without names: those of which another column is the derivative.
 
-        Args:
-            still: A column with the name of a position, which has one value throughout; empty for none.
+        ``still`` is a column with the name of a position, which has one value throughout; empty for none.
         """
         taken = {guess.column for guess in self.guesses}
         moving = [name for name in self.columns.columns if name not in taken and moves(self.columns.values(name))]
@@ -515,12 +508,7 @@ class _Guesser:
         return next((one for one in (2.0 * math.pi, 360.0, 1.0) if abs(turn / one - 1.0) < 0.1), 0.0)
 
     def _angle_unit(self, column: str, *, alone: bool) -> tuple[str, str]:
-        """Return the unit of an angle, and what shows it: jumps where it is wrapped, its speed, or its equation.
-
-        Args:
-            column: The angle.
-            alone: Whether it is the only joint.
-        """
+        """Return the unit of an angle (``alone``: of the only joint) and what shows it: jumps, speed or equation."""
         turn = self._turn(column)
         if turn:
             units = {"rad": 2.0 * math.pi, "deg": 360.0, "rev": 1.0}

@@ -93,14 +93,9 @@ _Rows = NDArray[np.bool_] | slice
 
 @dataclass(frozen=True)
 class Rules:
-    """A mapping that has been checked.
+    """A mapping that has been checked: sections of time and of each joint (one without a name for a plant of one).
 
-    Attributes:
-        time: Its section.
-        joints: Sections of each joint, by its name; one without a name for a plant of one.
-        origin: Where the mapping is from, for messages.
-        further: ``delimiter``, ``skip``, ``rows``, ``drop_nan`` and ``meta``.
-        guessed: Whether it was guessed, not read from a file.
+    ``origin`` is for messages; ``further`` has ``delimiter``, ``skip``, ``rows``, ``drop_nan`` and ``meta``.
     """
 
     time: Mapping[str, Any]
@@ -167,12 +162,9 @@ class JointMotion:
 
 @dataclass(frozen=True)
 class Motion:
-    """A recording in SI units.
+    """A recording in SI units: stamps, strictly increasing, shape (n,) [s], and at least one joint.
 
-    Attributes:
-        time: Strictly increasing, shape (n,) [s].
-        joints: At least one.
-        meta: What was done to it while it was read.
+    ``meta`` says what was done to it while it was read.
     """
 
     time: Array
@@ -184,14 +176,9 @@ class Motion:
 
 
 def load_rules(mapping: str | Path | Mapping[str, Any], recording: Path) -> Rules:
-    """Return the mapping of a recording.
+    """Return the mapping of a recording, from a file, a name in ``MAPPINGS`` or the mapping itself.
 
-    Args:
-        mapping: Mapping file, name of one of ``MAPPINGS``, or the mapping itself.
-        recording: What it is for, of those that the file may name.
-
-    Raises:
-        DataError: A key, or what it holds, is not one of a mapping.
+    A DataError if a key, or what it holds, is not one of a mapping.
     """
     if isinstance(mapping, Mapping):
         rules, origin = mapping, "mapping"
@@ -263,14 +250,9 @@ def _check_distinct_columns(joints: Mapping[str, Any], origin: str) -> None:
 
 @dataclass
 class _Track:
-    """A column that was found.
+    """A column that was found, its stamps [s] and values as the file has them, and its section of the mapping.
 
-    Attributes:
-        column: The column.
-        clock: Name of its clock; empty for equal steps.
-        stamps, values: As the file has them, stamps in seconds.
-        section: Its section of the mapping.
-        apart: Whether it has rows, or a clock, of its own.
+    ``clock`` is empty for equal steps; ``apart``: it has rows, or a clock, of its own.
     """
 
     column: Column
@@ -287,11 +269,7 @@ class _Track:
 
 
 def apply_rules(columns: Columns, rules: Rules) -> Motion:
-    """Return a recording in SI units.
-
-    Raises:
-        DataError: naming file, column, row and what was expected.
-    """
+    """Return a recording in SI units; a DataError names file, column, row and what was expected."""
     return _Reader(columns, rules).motion()
 
 

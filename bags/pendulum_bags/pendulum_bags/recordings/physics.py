@@ -29,12 +29,7 @@ _LEAST_EXPLAINED = 0.5
 
 
 class Slope(NamedTuple):
-    """Integrated velocity against travelled position.
-
-    Attributes:
-        slope: 1 in consistent units.
-        alike: Their correlation.
-    """
+    """Integrated velocity against travelled position: slope (1 in consistent units) and correlation (``alike``)."""
 
     slope: float
     alike: float
@@ -71,13 +66,7 @@ def turn_of(values: Array) -> float:
 
 
 def units_by_slope(slope: float, position: str, velocity: str) -> list[tuple[str, str, int]]:
-    """Return the units of position and velocity, and the velocity's sign, that a slope allows.
-
-    Args:
-        slope: See :class:`Slope`.
-        position: Unit of the position; empty for not known.
-        velocity: Unit of the velocity; likewise.
-    """
+    """Return the units of position and velocity, and the velocity's sign, that a slope allows; empty is not known."""
     sliding = position in UNITS["place"] or velocity in UNITS["speed"]
     places, speeds = ("place", "speed") if sliding else ("angle", "velocity")
     found = []

@@ -201,11 +201,7 @@ class Reading:
         return self._cache["motion"]
 
     def rows(self, time: Array) -> slice:
-        """Return the rows of some stamps [s] that lie in the part of the recording that was chosen.
-
-        Raises:
-            DataError: There are fewer than four.
-        """
+        """Return the rows of stamps [s] in the part that was chosen; a DataError if they are under four."""
         if self.start is None and self.stop is None:
             return slice(0, time.size)
         begin, stop = self.start or 0.0, math.inf if self.stop is None else self.stop
@@ -326,10 +322,7 @@ def _read_json(path: Path) -> Columns:
 def _read_hebi_log(path: Path, part: int, lab: str | Path | Mapping[str, Any] | None) -> Columns:
     """Return the columns of a HEBI log; the vendor's library stays with the bridge, whose program ``convert`` reads it.
 
-    Args:
-        path: The file.
-        part: Number of the module, from 1; 0 for the only one.
-        lab: Lab file with zero, sign and tare of the joint; None for those of the actuator.
+    ``part`` is the module's number from 1, 0 for the only one; ``lab`` its lab file with zero, sign and tare.
     """
     if isinstance(lab, Mapping):
         raise DataError(f"{path}: mapping is given as values; expected the lab file of a HEBI log")

@@ -33,11 +33,7 @@ def is_lerobot(folder: Path) -> bool:
 
 
 def read_parquet(path: Path) -> Columns:
-    """Return the columns of a Parquet file; lists and structs have one for each of their entries.
-
-    Raises:
-        DataError: It cannot be read, or pyarrow is missing.
-    """
+    """Return the columns of a Parquet file, one for each entry of lists and structs; a DataError if that fails."""
     parquet = _pyarrow(path, "parquet")
     try:
         file = parquet.ParquetFile(path)
@@ -66,14 +62,9 @@ def read_parquet(path: Path) -> Columns:
 
 
 def read_lerobot(folder: Path, part: int = 0) -> Columns:
-    """Return an episode of a LeRobot dataset of version 2 or 3.
+    """Return an episode of a LeRobot dataset of version 2 or 3, by its number from 1; 0 is the first, too.
 
-    Args:
-        folder: The dataset.
-        part: Number of the episode, from 1; 0 for the first.
-
-    Raises:
-        DataError: It is damaged, has no such episode, or pyarrow is missing.
+    A DataError if it is damaged, has no such episode, or pyarrow is missing.
     """
     arrow = _pyarrow(folder, "dataset")
     try:
@@ -119,14 +110,7 @@ def _labels(names: Any) -> Iterator[str]:
 
 
 def _arrow_columns(name: str, kind: Any, count: int, read: Pieces) -> Iterator[Column]:
-    """Yield a column of Arrow's as columns of numbers.
-
-    Args:
-        name: Of the column.
-        kind: Its type.
-        count: Number of rows.
-        read: Yields the pieces that hold some rows, each with the number of its first row.
-    """
+    """Yield a column of Arrow's as columns of numbers; ``read`` yields the pieces that hold some rows."""
     import pyarrow as pa
 
     if pa.types.is_struct(kind):

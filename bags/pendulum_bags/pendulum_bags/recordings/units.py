@@ -56,11 +56,7 @@ def quantity_of(unit: str) -> str:
 
 
 def input_quantity(unit: object, where: str, *, reference: bool = False) -> str:
-    """Return the quantity of an input by its unit; a reference may be a place, too.
-
-    Raises:
-        DataError: The unit is none of an input.
-    """
+    """Return the quantity of an input by its unit, else a DataError; a reference may be a place, too."""
     known = (*INPUTS, "place") if reference else INPUTS
     for quantity in known:
         if isinstance(unit, str) and unit in UNITS[quantity]:
@@ -70,11 +66,7 @@ def input_quantity(unit: object, where: str, *, reference: bool = False) -> str:
 
 
 def factor(unit: object, quantity: str, where: str) -> float:
-    """Return the factor from a unit to SI.
-
-    Raises:
-        DataError: The unit is not one of the quantity.
-    """
+    """Return the factor from a unit to SI; a DataError if the unit is not one of the quantity."""
     if not isinstance(unit, str) or unit not in UNITS[quantity]:
         raise DataError(f"{where} is {unit!r}; expected one of {', '.join(UNITS[quantity])}")
     return UNITS[quantity][unit]

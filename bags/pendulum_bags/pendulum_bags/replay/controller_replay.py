@@ -31,15 +31,9 @@ SETTLED = 1e-9
 
 @dataclass(frozen=True)
 class ControllerReplay:
-    """What a controller would have commanded, and what was commanded.
+    """Torque that was commanded and that a controller would have commanded, shape (n,) [N m].
 
-    Args:
-        controller: Its name.
-        description: Its gains in one line.
-        t: Time of each state that got a command, since the first of them, shape (n,) [s].
-        recorded: Torque that was commanded, shape (n,) [N m].
-        replayed: Torque of the controller now, shape (n,) [N m].
-        unanswered: States between the first and the last command that got none.
+    ``t`` counts from the first answered state [s]; ``unanswered``: states from first to last command that got none.
     """
 
     controller: str
@@ -102,11 +96,7 @@ class ControllerReplay:
 
 
 def recorded_controller(metadata: Mapping[str, Any]) -> tuple[str, dict[str, Any], str]:
-    """Return name, parameters and plant of the controller that made a recording, from the bag's metadata.
-
-    Raises:
-        DataError: The bag lacks it.
-    """
+    """Return name, parameters and plant of the controller that made a bag by its metadata, else a DataError."""
     run = run_record(metadata)
     recorded = run.get("controller")
     if not isinstance(recorded, Mapping) or "kind" not in recorded:
@@ -130,13 +120,13 @@ def replay_controller(
 
     Args:
         path: Recording of any format, with states and the torque that answered them; of a bag ``effort_command``.
-        controller: Name of the controller; None for the one that made the recording.
+        controller: Its name; None for the one that made the recording.
         plant: Plant to design on; None for that of the recording, or the thesis's where it was real hardware.
         values: Parameters of the controller.
         prefix: Namespace of the topics; None for that of the only plant.
 
     Raises:
-        DataError: The bag lacks states or commands, or no command has the stamp of a state.
+        DataError: States or commands are missing, or no command answers a state.
         ParameterError: No such controller or plant, or a value out of domain.
     """
     reading = Reading.of(path)
@@ -181,11 +171,7 @@ def replay_controller(
 
 
 def parse_values(texts: Sequence[str]) -> dict[str, object]:
-    """Return parameters from texts such as ``q=[100.0, 0.01]``; values are YAML.
-
-    Raises:
-        DataError: A text has no ``=``, or a name stands twice.
-    """
+    """Return parameters from texts such as ``q=[100.0, 0.01]`` (YAML); a DataError without ``=`` or if named twice."""
     import yaml
 
     values: dict[str, object] = {}

@@ -28,15 +28,10 @@ _WORDS = {
 
 
 def replay_fit(recording: Recording, plant: str | Path | PlantParameters, *, window: float = 1.0) -> InputReplay:
-    """Drive the fit of an identification with a recording, in windows and in free run.
+    """Drive the fit of an identification with a recording, in windows [s] and in free run.
 
-    Args:
-        recording: Data with any input.
-        plant: Plant file with its identification's JSON next to it, or that JSON; for a free swing any rigid plant.
-        window: Length of the windows [s], > 0.
-
-    Raises:
-        DataError: The recording has another input than the fit.
+    ``plant`` is a plant file with its identification's JSON next to it, or that JSON; for a free swing any rigid plant.
+    A DataError if the recording has another input than the fit.
     """
     if not window > 0.0:
         raise DataError(f"window is {window} s; expected > 0")

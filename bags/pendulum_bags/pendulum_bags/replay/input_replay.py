@@ -38,22 +38,10 @@ def replay_recording(
     effort: str = "applied",
     namespace: str | None = None,
 ) -> InputReplay:
-    """Read a recording (CSV or bag) and drive a plant with its torque.
+    """Read a recording, as ``read_recording`` does, and drive a plant with its torque in windows [s].
 
-    Args:
-        path: Recording, as for :func:`pendulum_bags.runs.read_recording.read_recording`.
-        plant: Plant file, preset or parameters.
-        window: Length of the windows [s].
-        mapping: Mapping file of a CSV.
-        hold: Of the input of a CSV, ``zero`` or ``linear``; by default that of its mapping.
-        effort: For bags, ``applied`` or ``measured`` torque.
-        namespace: For bags with several plants, such as ``/sim``.
-
-    A voltage, a set point or a free swing drives the fit that identification wrote next to the plant file.
-
-    Raises:
-        DataError: The recording is damaged, or its input is not supported.
-        ParameterError: The plant file is refused.
+    A voltage, a set point or a free swing drives the fit that identification wrote next to the plant file. A DataError
+    if the recording is damaged or its input not supported, a ParameterError if the plant file is refused.
     """
     recording = read_recording(path, mapping, effort=effort, namespace=namespace, hold=hold)
     if recording.input_kind != "effort" or (isinstance(plant, str | Path) and Path(plant).suffix == ".json"):
@@ -63,18 +51,10 @@ def replay_recording(
 
 
 def replay_input(recording: Recording, parameters: PlantParameters, *, window: float = 1.0) -> InputReplay:
-    """Drive a plant with the torque of a recording.
+    """Drive a plant with the torque of a recording; a DataError if its input is none.
 
-    Windows of a rigid plant have fitted initial states, by the same score that identification minimises; those of a
+    Windows [s] of a rigid plant have fitted initial states, by the score that identification minimises; those of a
     series-elastic plant start from smoothed measured states, for its motor's state is not measured.
-
-    Args:
-        recording: Data with torque input.
-        parameters: The plant.
-        window: Length of the windows [s], > 0.
-
-    Raises:
-        DataError: The input is no torque.
     """
     if recording.input_kind != "effort":
         raise DataError(
@@ -116,14 +96,9 @@ def replay_input(recording: Recording, parameters: PlantParameters, *, window: f
 
 @dataclass(frozen=True)
 class _Driven:
-    """A recording at a fixed period, and a plant that can be run along it.
+    """A recording at a fixed period, shape (n,), and a plant that can be run along it.
 
-    Args:
-        time: Uniform times, shape (n,) [s].
-        position: Measured angle, shape (n,) [rad].
-        velocity: Slope of a parabola through the neighbouring angles, shape (n,) [rad/s].
-        torque: Mean torque from each time to the next, shape (n - 1,) [N m].
-        plant: The model.
+    The velocity is the slope of a parabola through neighbouring angles, the torque, shape (n - 1,), a mean.
     """
 
     time: Array

@@ -24,17 +24,9 @@ __all__ = ["JointReplay", "replay_joints"]
 
 @dataclass(frozen=True)
 class JointReplay:
-    """A plant of several joints along a recording.
+    """A plant of n joints along a recording, in windows [s]: errors by joint, and positions, shape (k, n) [rad or m].
 
-    Attributes:
-        name: Of the recording.
-        plant: Its name.
-        joints: Of the plant, n of them.
-        window: Length of the windows [s].
-        score: Errors by joint.
-        time: Of the samples in windows, shape (k,) [s].
-        measured, simulated: Positions, shape (k, n) [rad or m].
-        renamed: Which of its joints are taken for those of the plant; empty where they have its names.
+    ``renamed``: which of the recording's joints are taken for those of the plant; empty where they have its names.
     """
 
     name: str
@@ -103,17 +95,9 @@ def replay_joints(
     window: float = 1.0,
     mapping: str | None = None,
 ) -> JointReplay:
-    """Drive a plant of several joints with the efforts of a bag or a CSV file.
+    """Drive a plant of several joints with the efforts of a recording, in windows [s].
 
-    Args:
-        path: Recording, as for :func:`~pendulum_bags.identification.joint_recordings.read_joints`.
-        plant: Plant file, preset or parameters.
-        window: Length of the windows [s], > 0.
-        mapping: Mapping file of a CSV.
-
-    Raises:
-        DataError: The recording is damaged, or of other joints.
-        ParameterError: The plant file is refused.
+    A DataError if it is damaged or of other joints, a ParameterError if the plant file is refused.
     """
     if not window > 0.0:
         raise DataError(f"window is {window} s; expected > 0")

@@ -26,14 +26,7 @@ DIVERGED = 0.1
 
 @dataclass(frozen=True)
 class HorizonError:
-    """Error of predictions over a horizon, from measured states.
-
-    Args:
-        steps: Horizon in samples, 1 for one-step.
-        time: The same [s].
-        rms: Root mean square angle error at its end [rad].
-        starts: Number of predictions.
-    """
+    """Error of predictions from measured states: rms angle at the end of a horizon [rad], over a number of starts."""
 
     steps: int
     time: float
@@ -164,13 +157,9 @@ def fit_percent(measured: Array, simulated: Array) -> float:
 def horizon_errors(
     size: int, period: float, longest: float, error_from: Callable[[int, int], Array]
 ) -> tuple[HorizonError, ...]:
-    """Return errors of predictions after 1, 2, 5, 10, 20, ... samples, up to the longest horizon.
+    """Return errors of predictions after 1, 2, 5, 10, 20, ... samples, up to the longest horizon [s].
 
-    Args:
-        size: Number of samples.
-        period: Time between two [s].
-        longest: Longest horizon [s].
-        error_from: Maps the sample of a start and a number of steps to the angle errors there and after each [rad].
+    ``error_from`` maps the sample of a start and a number of steps to the angle errors there and after each [rad].
     """
     reach = min(max(1, round(longest / period)), size - 1)
     starts = np.unique(np.linspace(0, size - 1 - reach, MOST_STARTS).astype(int))
