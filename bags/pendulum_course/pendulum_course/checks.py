@@ -173,8 +173,7 @@ def _percent(share: float) -> str:
 def _what_is_missing(since: Any, untold: Any, until: float) -> str:
     """Return which torques a recording lacks around a fault, or "": missing ones may have acted.
 
-    Times of torques (``since``), of states without one (``untold``) and of the next arming (``until``) are [s] after
-    it.
+    Times of torques (``since``), of states without one (``untold``) and of the next arming (``until``) [s].
     """
     start, end = -_STOPPED_WITHIN, min(until, _WATCHED)
     watched = np.sort(since[(since > start) & (since <= end)])

@@ -42,11 +42,7 @@ _MOST_DRAWS = 50
 
 
 class SwingUp:
-    """N plants of n joints, m of them driven, under one policy.
-
-    Raises:
-        ParameterError: The plant is series elastic, has no motor, or a delay of its own.
-    """
+    """N plants of n joints, m driven, under one policy; a ParameterError for springs, no motor, or a delay."""
 
     def __init__(
         self,

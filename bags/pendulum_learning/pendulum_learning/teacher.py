@@ -34,14 +34,11 @@ class TeacherOutput(NamedTuple):
 
 
 class Teacher:
-    """The stored swing-up of a plant, tracked from any state near it; ``period`` of the commands in [s].
+    """The stored swing-up of a plant, or a ParameterError, tracked from any state near it at ``period`` [s].
 
     Attributes:
         states: Its nodes, deviations from upright and velocities, shape (K, 2n).
         efforts: At the nodes, shape (K, m) [N m or N].
-
-    Raises:
-        ParameterError: No swing-up is stored for the plant.
     """
 
     def __init__(self, plant: PlantParameters, period: float) -> None:

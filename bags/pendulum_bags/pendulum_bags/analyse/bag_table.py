@@ -1,8 +1,4 @@
-"""The same questions for many recordings: a row for each plant of each, one for each run folder; here or on a cluster.
-
-:data:`~pendulum_bags.analyse.questions.QUESTIONS` lists them. Results are stored per bag, and computed again only if
-the bag has changed.
-"""
+"""The questions of :mod:`pendulum_bags.analyse.questions` for many recordings, here or on a cluster, cached."""
 
 from __future__ import annotations
 

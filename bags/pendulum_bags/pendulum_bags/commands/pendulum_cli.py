@@ -90,14 +90,7 @@ _EXAMPLES = (
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run ``pendulum COMMAND ARGUMENTS`` and return the exit code.
-
-    What follows the command is the program's own and handed on untouched, arguments of ROS among it. Nothing but that
-    program is imported.
-
-    Args:
-        argv: Arguments; by default those of the process.
-    """
+    """Run ``pendulum COMMAND ARGUMENTS`` untouched, importing that program alone, and return the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands = {name: target for section in SECTIONS.values() for name, target in section.items()}
     code = answer_of_dispatcher(

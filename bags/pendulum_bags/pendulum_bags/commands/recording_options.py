@@ -50,11 +50,7 @@ def readings_of(
     start: float | None = None,
     stop: float | None = None,
 ) -> list[Reading]:
-    """Return recordings with the options that a user gave.
-
-    Raises:
-        DataError: There are neither one mapping, nor one for each, nor none; or an option is out of domain.
-    """
+    """Return recordings with the user's options; a DataError for one out of domain, or not one mapping for each."""
     from pendulum_bags.recordings.reading import Reading
 
     given = list(mappings or [])
@@ -75,11 +71,7 @@ def readings_of(
 
 
 def show_guesses(console: Console, readings: Sequence[Reading], write_to: Path | None) -> None:
-    """Print what was guessed, and write it where that is wanted.
-
-    Raises:
-        DataError: There is nothing to write, and no other error is on its way.
-    """
+    """Print what was guessed, and write it if requested; a DataError if there is nothing to write."""
     from pendulum_bags.recordings.reading import print_guesses, write_mapping
 
     files = [reading for reading in readings if reading.was_mapped]

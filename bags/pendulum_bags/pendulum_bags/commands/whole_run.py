@@ -79,11 +79,7 @@ def budget_of(given: float | None, contenders: int, seeds: int, *, joints: bool 
 
 
 def steps_of(only: Sequence[str] | None, budget: float) -> Sequence[str]:
-    """Return the steps of a run.
-
-    Raises:
-        ParameterError: One is unknown, or has no time.
-    """
+    """Return the steps of a run; a ParameterError for one that is unknown or has no time."""
     from pendulum_bags.whole.carry_out import STEPS
 
     if unknown := set(only or ()) - set(STEPS):
@@ -101,14 +97,7 @@ def run_whole(
     json_output: bool,
     remark: Callable[[Path], str] = lambda folder: "",
 ) -> None:
-    """Carry out a run, print its answer and write its page.
-
-    Args:
-        out: Folder of the run, or None.
-
-    Raises:
-        typer.Exit: The user interrupted it.
-    """
+    """Carry out a run into ``out`` or a new folder, print its answer and write its page."""
     from pendulum_bags.whole.carry_out import carry_out
     from pendulum_bags.whole.page import leave_files_out, write_whole_report
     from pendulum_bags.whole.words import whole_answer

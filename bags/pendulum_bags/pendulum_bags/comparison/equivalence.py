@@ -1,8 +1,4 @@
-"""Equivalence tests against a stated margin: two one-sided tests, and their result as text.
-
-Two one-sided tests (Schuirmann, J. Pharmacokinet. Biopharm. 15, 1987): equivalent if the 90 % interval lies inside the
-margin, different if it lies outside, else undecided, with the number of runs that would probably decide.
-"""
+"""Equivalence by two one-sided tests (Schuirmann, J. Pharmacokinet. Biopharm. 15, 1987), and their result as text."""
 
 from __future__ import annotations
 
@@ -108,11 +104,7 @@ def equivalence_test(
     runs: int = 1,
     ratio: bool = False,
 ) -> EquivalenceTest:
-    """Test one quantity; ``low`` is minus infinity for a one-sided test.
-
-    Args:
-        outside: Interval that shows a difference where it lies beyond a margin; by default ``interval``.
-    """
+    """Test one quantity; ``low`` may be minus infinity, ``outside`` (by default ``interval``) shows a difference."""
     scale = _logarithm if ratio else float
     estimate, left, right = (scale(value) for value in (interval.estimate, interval.low, interval.high))
     bottom, top = (scale(value) for value in (low, high))

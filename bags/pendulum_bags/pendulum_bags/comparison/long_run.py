@@ -41,11 +41,7 @@ _ORDER = 4
 
 @dataclass(frozen=True)
 class Disturbance:
-    """White noise; each value is held for ``hold`` [s].
-
-    Args:
-        t: Times at which it takes a new value, shape (n,) [s].
-    """
+    """White noise: new values at the times ``t``, shape (n,) [s], each held for ``hold`` [s]."""
 
     t: Array
     value: Array
@@ -99,12 +95,7 @@ class Moments:
 
 
 def moments(clock: SlowClock, motions: Array, disturbance: Disturbance | None, blocks: int) -> Moments:
-    """Return the sums of products of one run.
-
-    Args:
-        motions: Band-limited, at the even times of the clock, shape (n, m).
-        disturbance: Its noise, on the same time axis, or None.
-    """
+    """Return the sums of products of one run, from band-limited motions at the clock's even times, shape (n, m)."""
     size = len(motions)
     modes, gram, squares = np.empty((size, 0)), np.empty((0, 0)), np.zeros(size)
     short = np.ones(motions.shape[1])

@@ -21,8 +21,7 @@ _LEVEL = 0.95
 class Band:
     """The band in which another run of a machine lies at each time with 95 % probability (Student's t of the runs).
 
-    Attributes:
-        own: Mean share inside for each run of the machine, in the band of the others; NaN for fewer than three runs.
+    ``own`` is the mean share inside for each run of the machine, in the band of the others; NaN for fewer than three.
     """
 
     coverage: float

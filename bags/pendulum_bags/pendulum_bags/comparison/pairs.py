@@ -43,9 +43,7 @@ class Difference:
 def interpolated_difference(simulation: Series, hardware: Series, *, at: str = "simulation") -> Difference:
     """Return the difference, with one motion interpolated by cubic splines at the other's stamps.
 
-    Args:
-        at: ``simulation`` for the simulation's stamps, as in the thesis; ``slower`` for those of the motion with fewer
-            samples, so that every sample was measured.
+    ``at`` is ``simulation`` for its stamps, as in the thesis, or ``slower`` for those of the motion with fewer samples.
     """
     start, stop = shared_span(simulation, hardware)
     use_simulation = at == "simulation" or simulation.period > 1.01 * hardware.period
@@ -144,11 +142,7 @@ class Pair:
 
     @property
     def unlike_references(self) -> str:
-        """Why two moving references differ under the noise; empty where they agree, or none moved.
-
-        A reference starts with its controller and the noise later, in real time not equally later on both sides: then
-        runs of one plant differ by more than the plants may.
-        """
+        """Why two moving references differ under the noise (in real time they start at other times), or ""."""
         ours, theirs = self.simulation, self.hardware
         if not ours.follows_reference and not theirs.follows_reference:
             return ""

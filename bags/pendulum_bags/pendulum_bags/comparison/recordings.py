@@ -129,10 +129,7 @@ def compare_recordings(
     shared: Sequence[Shared] | None = None,
     margins: Margins | None = None,
 ) -> Comparison:
-    """Compare a simulation with at least one run of a machine.
-
-    Args:
-        shared: What each has in common with the simulation; None to find it.
+    """Compare a simulation with at least one run of a machine; ``shared`` is found by default.
 
     Raises:
         DataError: There is nothing to compare, a plant did not move, or the recordings have no time in common.

@@ -238,8 +238,8 @@ class _Seen:
     def lagged(self, lags: Array, *, sloped: bool = True) -> tuple[Array, Array, Array]:
         """Return the simulation's velocity earlier by each lag and its slope, shape (n, len(lags)), and the hardware's.
 
-        Where the simulation is the slower one, the sides are exchanged. The slope is to the previous sample: it jumps
-        where the noise changes.
+        Where the simulation is slower, both are exchanged. The slope is to the previous sample: it jumps with the
+        noise.
         """
         times = self.clock.times
         moving, still = (self.hardware, self.simulation) if self.is_slower else (self.simulation, self.hardware)

@@ -95,11 +95,8 @@ def play_in_lockstep(
 ) -> Path:
     """Start a simulator (``sim``) or an emulated actuator (``hw``), play on it in lockstep, and record.
 
-    ``noise`` is the standard deviation of the simulated angle sensor [rad]; ``domain`` is None for any free one.
-
-    Raises:
-        BagError: The bag exists.
-        FaultError: The plant faulted, for instance beyond its limits, or a program ended.
+    ``noise`` is the standard deviation of the simulated angle sensor [rad]; ``domain`` is None for any free one. A
+    BagError if the bag exists, a FaultError if the plant faulted or a program ended.
     """
     refuse_existing(bag)
     limits: dict[str, Any] = {

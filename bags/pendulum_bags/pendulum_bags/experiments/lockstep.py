@@ -104,14 +104,10 @@ def record_run(
     on_wait: Callable[[], None] = lambda: None,
     hosts: HostPool | None = None,
 ) -> Path:
-    """Carry out one run over DDS, in lockstep or in real time, and record it.
+    """Carry out one run over DDS, in lockstep or in real time, and record it into a new bag.
 
     ``domain`` is None for any free one; ``on_wait`` is called while waiting; ``hosts`` run the programs of lockstep
-    runs.
-
-    Raises:
-        BagError: The bag exists.
-        FaultError: A program ended or did not respond, or the plant faulted.
+    runs. A FaultError if a program ended or did not respond, or the plant faulted.
     """
     refuse_existing(bag)
     namespace, simulated = spec.namespace, spec.simulated_time

@@ -99,10 +99,7 @@ class Machine:
             shutil.rmtree(run.bag, ignore_errors=True)
 
     def rests(self) -> bool:
-        """Let no run begin before :meth:`resume`; return whether none is being recorded.
-
-        The program may start late: on a busy computer it takes minutes.
-        """
+        """Let no run begin before :meth:`resume`; return whether none is being recorded."""
         if self._child is None or self._child.process.poll() is not None:
             return True
         self._hold.touch()

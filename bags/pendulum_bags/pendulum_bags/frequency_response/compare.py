@@ -91,11 +91,7 @@ def continuous(measured: MeasuredResponse, model: LinearModel) -> Complex:
 def compare_responses(
     first: MeasuredResponse, second: MeasuredResponse, model: LinearModel, scaling: SignalScaling = DEFAULT_SCALING
 ) -> Difference:
-    """Return the difference of simulation and hardware, at the sampling period of the second.
-
-    ``model`` of either converts the first; ``scaling`` has the units of the gap. A DataError for too few common
-    frequencies.
-    """
+    """Return the difference of simulation and hardware, at the sampling period of the second, or a DataError."""
     lines, one, spread_one, two, spread_two = _at_common_lines(first, second)
     moved = brought_to(one, model, lines, measured=first.period, period=second.period)
     spread_one = spread_one * np.abs(moved / one)

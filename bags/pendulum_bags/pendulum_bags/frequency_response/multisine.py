@@ -18,10 +18,7 @@ _HIGHEST_OF_JOINTS = 100.0
 
 @dataclass(frozen=True)
 class Multisine:
-    """Whole periods of a multisine, of which one more settles.
-
-    Amplitude [N m], period [s], lowest and highest frequency [Hz], and the largest number of frequencies.
-    """
+    """Whole periods of a multisine, of which one more settles: amplitude [N m], period [s], frequencies [Hz]."""
 
     amplitude: float = 2.5
     signal_period: float = 4.0

@@ -19,10 +19,7 @@ __all__ = ["Analysis"]
 
 @dataclass(frozen=True)
 class Analysis:
-    """The analysis of responses of simulation, hardware, or both, with the model of the designs' plant.
-
-    ``difference`` is None for one of them, ``certifier`` without hardware.
-    """
+    """The analysis of responses with the designs' plant; ``difference`` needs both, ``certifier`` the hardware."""
 
     responses: Sequence[MeasuredResponse]
     model: LinearModel

@@ -72,14 +72,7 @@ class ReportData:
 
 
 def read_trials(folder: str | os.PathLike[str]) -> TrialSet:
-    """Read the bags ``trial_1``, ``trial_2``, ... of a folder and regress them as the thesis does.
-
-    The holds of a staircase distinguish it from motions by hand.
-
-    Raises:
-        BagError: A bag cannot be read.
-        DataError: There is no trial, or one lacks what the regression needs.
-    """
+    """Read the bags ``trial_1``, ``trial_2``, ... and regress them as the thesis does, or raise a DataError."""
     bags = sorted(Path(folder).glob("trial_*"), key=lambda bag: (len(bag.name), bag.name))
     if not bags:
         raise DataError(f"{folder} has no bags trial_1, trial_2, ...; expected the trials of one experiment")

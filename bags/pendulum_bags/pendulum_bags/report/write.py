@@ -93,11 +93,7 @@ def write_joint_report(
     answer: Answer,
     extend: Callable[[Page], Page] = lambda page: page,
 ) -> Path:
-    """Write ``report.html`` and ``figures/`` of plants of several joints into ``out``; return the page.
-
-    Raises:
-        BagError: The folder cannot be written.
-    """
+    """Write ``report.html`` and ``figures/`` of several joints into ``out``, or raise a BagError; return the page."""
     pairs = len(next(iter(comparisons.values())).pairs)
     return _save(out, extend(joint_page(comparisons, answer, title=title_of(folders, pairs))), formats)
 

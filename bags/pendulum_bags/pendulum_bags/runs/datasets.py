@@ -220,10 +220,7 @@ def data_notes(recording: Recording) -> list[str]:
 
 
 def gaps(recording: Recording) -> list[tuple[float, float]]:
-    """Return where neither motion nor input is known: (start, end) from the first sample [s].
-
-    A gap is longer than ten median periods and than 0.1 s, in the stamps of the motion or of the input.
-    """
+    """Return where neither motion nor input is known for ten median periods and 0.1 s: (start, end) [s]."""
     found = []
     for stamps in {id(s): s for s in (recording.time, recording.input_stamps)}.values():
         for i in np.flatnonzero(np.diff(stamps) > longest_step(stamps)):
@@ -258,10 +255,7 @@ def _joints(time: Array, position: Array) -> NDArray[np.int64]:
 def unwrap(recording: Recording) -> Recording:
     """Return the recording with a continuous angle, and the number of whole turns removed as ``unwrapped`` in ``meta``.
 
-    It is cut where the angle jumps once for good, as in joined recordings.
-
-    Raises:
-        DataError: The angle jumps by something else again and again, faster than any pendulum turns.
+    It is cut where the angle jumps once for good. A DataError for repeated jumps by anything else.
     """
     position = recording.position
     jumps = np.abs(np.diff(position)) > np.pi

@@ -139,12 +139,7 @@ class RunData:
 def joints_of(
     path: str | os.PathLike[str], prefix: str | None = None, *, open_bag: OpenBag = read_bag
 ) -> tuple[str, ...]:
-    """Return the joints of a bag's plant of several joints, in order; none for a plant of one.
-
-    Raises:
-        BagError: The bag cannot be read.
-        DataError: It lacks the states.
-    """
+    """Return the joints of a bag's plant of several joints, in order, or none; a DataError if it lacks the states."""
     reading = Reading.of(path)
     bag_of: AbstractContextManager[Bag | None] = open_bag(path) if reading.is_bag else nullcontext()
     with bag_of as bag:

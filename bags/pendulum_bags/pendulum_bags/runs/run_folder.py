@@ -55,11 +55,7 @@ _PACKAGES = (
 
 
 def create_run_folder(out: Path | None, experiment: str) -> Path:
-    """Create and return the folder of a run, by default ``bags/runs/<UTC>_<experiment>`` below the current folder.
-
-    Raises:
-        BagError: The folder exists and is not empty, or cannot be written.
-    """
+    """Create and return the folder of a run, by default ``bags/runs/<UTC>_<experiment>``, or raise a BagError."""
     if out is None:
         stamp = datetime.now(timezone.utc).strftime("%Y-%m-%dT%H-%M-%SZ")
         out = Path("bags", "runs", f"{stamp}_{experiment}")

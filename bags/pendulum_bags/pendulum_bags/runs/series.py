@@ -174,10 +174,7 @@ def uniform_times(start: float, stop: float, period: float) -> Array:
 
 
 def unwrap_near_upright(position: ArrayLike) -> Array:
-    """Return continuous angles, moved by whole turns so that their median lies in [-pi/2, 3 pi/2) [rad].
-
-    Hanging (0) and upright (pi) are both far from the ends of that range.
-    """
+    """Return continuous angles, moved by whole turns so that their median lies in [-pi/2, 3 pi/2) [rad]."""
     angles = np.unwrap(np.asarray(position, dtype=float))
     turn = 2.0 * np.pi
     return angles - turn * np.floor((np.median(angles) + 0.25 * turn) / turn)

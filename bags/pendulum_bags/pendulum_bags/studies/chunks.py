@@ -1,8 +1,4 @@
-"""Work in numbered pieces: here or on a Dask cluster, stored on disk, resumed after an interruption.
-
-A piece is a pure function of a job and its number: the result is independent of the workers, and a dead one costs time
-only.
-"""
+"""Work in numbered pieces, pure functions of job and number: here or on a Dask cluster, stored, resumed."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Studies of many closed loops: a plant drawn from its uncertainty, held upright by its LQR, in chunks.
-
-Chunk c draws from the stream (seed, c), so results are bit-identical for any number of workers.
-"""
+"""Studies of many closed loops: a plant drawn from its uncertainty, held upright by its LQR, in reproducible chunks."""
 
 from __future__ import annotations
 

@@ -98,10 +98,7 @@ class Entry:
 
 
 def costs_of(arrays: RunArrays) -> tuple[bool, float, dict[str, float]]:
-    """Return success, the share of time spent up, and the costs of a run.
-
-    ``time`` is when the pendulum enters the goal region for good, else the length of the run.
-    """
+    """Return success, share of time spent up, and costs; ``time`` is the final entry into the goal region."""
     t = (arrays.stamp_ns - arrays.stamp_ns[0]) / NANOSECONDS
     duration = float(t[-1])
     up = (np.abs(wrap(arrays.position - UPRIGHT)) < GOAL_ANGLE) & (np.abs(arrays.velocity) < GOAL_VELOCITY)

@@ -41,10 +41,7 @@ class StudyProgress:
 
 
 def default_workers(study: Study) -> int:
-    """Return how many runs to carry out at once: one in real time, else one more than cores.
-
-    The nodes of a run wait for each other and for the middleware: one run a core leaves a third idle.
-    """
+    """Return how many runs to carry out at once: one in real time, else one more than cores, since nodes wait."""
     return 1 if study.realtime or any(run.lab for run in study.runs) else 1 + (os.cpu_count() or 1)
 
 

@@ -57,10 +57,7 @@ def analyse(folder: Path, study: Study) -> list[dict[str, Any]]:
 
 
 def commanded_recording(bag_folder: Path, spec: RunSpec) -> Recording:
-    """Return the motion of a run with the commanded torque of controller and disturbance as its input.
-
-    Not ``applied_effort``: the strategies differ in what the actuator makes of the command.
-    """
+    """Return the motion of a run with the commanded (not applied) torque of controller and disturbance as its input."""
     with read_bag(bag_folder) as bag:
         states = bag[f"{spec.namespace}/joint_states"]
         command = bag[f"{spec.namespace}/effort_command"]

@@ -177,10 +177,7 @@ def parse_uncertainty(text: str, plant: str) -> Uncertainty:
 
 
 def uncertainty_of(plant_file: str) -> Uncertainty:
-    """Return an identification's uncertainty, by the intervals of its plant file, or raise a ParameterError.
-
-    For one joint it is the covariance, if the JSON of ``identify --out`` lies next to the file.
-    """
+    """Return an identification's uncertainty, for one joint the covariance next to the file, or a ParameterError."""
     plant, provenance = load_plant_file(plant_file)
     intervals = provenance.get("intervals", {}) if Path(plant_file).suffix else {}
     names = VARIED if plant.is_pendulum else intervals

@@ -243,11 +243,7 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest], refused
 
 
 def recordings_of(comparison: Comparison) -> list[str]:
-    """Return the compared recordings to identify the hardware from, as many as a line holds.
-
-    A repeat in lockstep stays upright, where gravity has little effect, so the first run precedes it even if it is not
-    tested.
-    """
+    """Return the compared recordings to identify the hardware from, the first run before its repeats."""
     sources = [pair.hardware.source for pair in comparison.pairs if pair.hardware.source]
     repeated = [path.parents[2] / path.name for path in map(Path, sources) if path.parts[-3:-2] == (REPEATS,)]
     runs = [str(path) for path in repeated if path.is_dir()]

@@ -211,11 +211,8 @@ def carry_out(
 ) -> Findings:
     """Record, identify and compare until the budget ends or the user interrupts; return the findings.
 
-    ``leaving`` ends the programs and leaves the graph; close it last.
-
-    Raises:
-        FaultError: The first recordings failed.
-        KeyboardInterrupt: The user interrupted it before the first layer.
+    ``leaving`` ends the programs and leaves the graph; close it last. A FaultError if the first recordings failed, a
+    KeyboardInterrupt before the first layer.
     """
     run = _Run(folder, order, progress, on_first)
     leaving.enter_context(run.machine)

@@ -77,8 +77,7 @@ def contender_specs(
 ) -> dict[str, list[tuple[RunSpec, RunSpec]]]:
     """Return the runs of at most ``count`` contenders on both sides, under each seed of the noise.
 
-    Controllers that refuse the plant are left out, and those that command the same as an earlier one: they would count
-    twice in a correlation.
+    Controllers that refuse the plant are left out, and those that command the same as an earlier one.
     """
     found: dict[str, list[tuple[RunSpec, RunSpec]]] = {}
     seen: list[Any] = []

@@ -20,11 +20,7 @@ _CONSOLE = "pendulum_console.console.console_node"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the console.
-
-    Args:
-        argv: Arguments; by default those of the process.
-    """
+    """Run the console."""
     # Two seconds of imports delayed a loop at 500 Hz by 9 ms. The thread is niced, not the process: a later stop
     # must not wait behind other processes.
     loading = threading.Thread(target=_load)

@@ -78,11 +78,7 @@ class _Plant:
 
 
 class Hub:
-    """The console's end of the graph; requests raise FaultError with the reason of a refusal.
-
-    States and torques come at up to 2 kHz and are drawn at 60 Hz, so their inputs hold one message and are polled per
-    frame.
-    """
+    """The console's end of the graph; requests raise FaultError with the reason of a refusal."""
 
     def __init__(self) -> None:
         set_middleware_defaults()

@@ -1,7 +1,6 @@
 """A node that passes the graph to viewers: topics as on the wire, parameters, and services to call.
 
-It publishes nothing, and no viewer can: torques come from controllers. Services keep their rules: an e-stop latches,
-and a plant may refuse arming.
+Nothing is published: torques come from controllers only. An e-stop latches, and a plant may refuse arming.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""Access control of websockets: local programs and viewers, pages that the user named, the token.
-
-Any site open in a local browser can reach ``localhost`` and a service that arms a plant; the browser's ``Origin``
-header distinguishes it from a viewer.
-"""
+"""Access control of websockets: local programs and viewers, pages that the user named (by ``Origin``), the token."""
 
 from __future__ import annotations
 

@@ -53,10 +53,7 @@ SPECS = (
 class Recorder(PollingNode):
     """Subscribes to topics as they appear and hands their bytes to a :class:`RecordingSession`.
 
-    Messages are polled every 20 ms, at a tenth of an executor's cost. ``stop`` requests the runner to end the process.
-
-    Raises:
-        BagError: The output folder exists or cannot be created.
+    Messages are polled every 20 ms, at a tenth of an executor's cost. A BagError if the output folder is not new.
     """
 
     def __init__(self, options: RecorderOptions, stop: Callable[[], None]) -> None:

@@ -65,13 +65,9 @@ class _Area:
 
 
 class McapLayout:
-    """The bytes of one growing MCAP file.
+    """The bytes of one growing MCAP file, whose ``header`` is magic and header record.
 
     Methods raise OSError when the disk is full or fails; readers then see the file as before the call.
-
-    Args:
-        header: Magic and header record.
-        summary: Content of the file's summary; its owner changes it and calls ``publish``.
     """
 
     def __init__(self, path: Path, header: bytes, summary: McapSummary) -> None:

@@ -71,11 +71,7 @@ def build_chunk(
 
 
 class McapSummary:
-    """Topics, counts and the index of chunks, stored as their bytes in the file.
-
-    Small, *staged* chunks are replaced by one large, *settled* chunk. The index of settled chunks grows by about 100
-    bytes per megabyte of messages.
-    """
+    """Topics, counts and the index of chunks as bytes; *settled* chunks replace small *staged* ones."""
 
     def __init__(self) -> None:
         self.channels: dict[int, bytes] = {}

@@ -47,9 +47,8 @@ def typestore() -> Typestore:
 def message_type(name: str, type_hash: str = "") -> MessageType:
     """Return definition and hash of a type ``package/msg/Name``; a BagError for other names.
 
-    Types outside the ROS distribution are read from ``share/PACKAGE/msg/NAME.msg`` under ``AMENT_PREFIX_PATH``. An
-    unknown type has no definition; its messages are recorded all the same. ``type_hash`` from discovery overrides the
-    computed hash.
+    Types outside the ROS distribution are read from ``AMENT_PREFIX_PATH``; an unknown one has no definition.
+    ``type_hash`` from discovery overrides the computed hash.
     """
     if len(name.split("/")) != 3:
         raise BagError(f"message type is {name!r}; expected package/msg/Name")

@@ -77,10 +77,9 @@ def qos_yaml(profiles: Sequence[QosProfile], indent: str = "") -> str:
 
 
 class MetadataFile:
-    """Renders and replaces ``metadata.yaml`` of one bag.
+    """Renders and replaces ``metadata.yaml`` of one bag, many times a second.
 
-    A recorder rewrites the file many times a second: the text of topics and run metadata is cached, and two files take
-    turns by exchanging names, because creating and renaming a new file costs ext4 thirty times as much.
+    Its text is cached, and two files exchange names: creating and renaming one costs ext4 thirty times as much.
     """
 
     def __init__(self, folder: Path, storage: str, ros_distro: str) -> None:
@@ -135,8 +134,7 @@ class MetadataFile:
     def update(self, topics: Sequence[TopicEntry], files: Sequence[FileEntry], custom_data: Mapping[str, str]) -> None:
         """Write the file during the recording; a reader, or a kill at any moment, sees the old text or the new.
 
-        A reader that is still reading at the update after next may see parts of both. Raises OSError if the disk is
-        full or fails, or the folder was moved; the file is then unchanged.
+        A reader at the update after next may see both. Raises OSError if the disk fails or the folder was moved.
         """
         data = self.render(topics, files, custom_data).encode()
         if not self._take_turns(data):

@@ -15,10 +15,9 @@ INFINITE_NS = 2**63 - 1
 
 @dataclass(frozen=True, slots=True)
 class QosProfile:
-    """Offered QoS of one publisher, in rosbag2's terms and rmw's defaults.
+    """Offered QoS of one publisher, in rosbag2's terms and rmw's defaults, ``unknown`` and 0 if not discovered.
 
-    ``history`` is ``unknown`` and ``depth`` 0 if discovery does not report them; ``lifespan_ns`` is the age after which
-    a message is worthless, ``lease_ns`` the liveliness lease.
+    ``lifespan_ns`` is the age after which a message is worthless, ``lease_ns`` the liveliness lease.
     """
 
     history: str = "keep_last"

@@ -30,12 +30,8 @@ _CHANNEL_SIZE = 35
 class SealedMcapFile:
     """Append messages to a new MCAP file; after ``seal`` every reader sees them. ``compression`` is None or "zstd".
 
-    Each seal adds a small chunk. After about a megabyte the small chunks are rewritten as one, so neither the time of a
-    seal nor the writer's memory grows with the recording.
-
-    Raises:
-        BagError: The file exists.
-        OSError: In all methods: the disk is full or fails; the file still shows what was flushed before.
+    Each seal adds a small chunk; about each megabyte they are rewritten as one, so neither seals nor memory grow. A
+    BagError if the file exists; an OSError, in all methods, if the disk fails: the flushed messages remain.
     """
 
     def __init__(self, path: Path, *, compression: str | None = None) -> None:

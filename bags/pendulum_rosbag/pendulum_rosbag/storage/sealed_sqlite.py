@@ -46,9 +46,7 @@ _INDEX = "CREATE INDEX timestamp_idx ON messages (timestamp ASC)"
 class SealedSqliteFile:
     """Append messages to a new rosbag2 database; after ``seal`` every reader sees them.
 
-    Raises:
-        BagError: The file exists.
-        OSError: In all methods: the disk is full or fails; the file still shows what was sealed before.
+    A BagError if the file exists; an OSError, in all methods, if the disk fails: the flushed messages remain.
     """
 
     def __init__(self, path: Path, *, ros_distro: str = "jazzy") -> None:
