@@ -12,11 +12,15 @@ import numpy as np
 import pytest
 from sensor_msgs.msg import JointState
 
+from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.joint_run import JointSettings, default_amplitude
+from pendulum_bags.experiments.settings import NoiseSettings
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 from pendulum_msgs_py.ros import qos
 from pendulum_rosbag.reader import read_bag
+from pendulum_sim.exports.model_files import mjcf
 from pendulum_testing.policies import lqr_policy
 from pendulum_testing.refusals import Refused, not_refused
 from tests.joints_peer import JointsPeer
@@ -261,3 +265,25 @@ REFUSED: list[Refused] = [
 
 def test_what_does_not_fit_several_joints_is_refused_in_one_sentence(domain_id: int) -> None:
     assert not_refused(REFUSED) == []
+
+
+def test_the_nodes_of_a_foreign_model_of_two_joints_give_the_states_of_one_process_bit_for_bit(
+    processes, domain_id: int, tmp_path: Path
+) -> None:
+    pytest.importorskip("mujoco")
+    model, bag = tmp_path / "model.xml", tmp_path / "bag"
+    model.write_text(mjcf(load_mechanism("cart_pole")), encoding="utf-8")
+    command = ("experiment", "lockstep", "--plant", "cart_pole", "--simulation", model, "--duration", "0.2")
+    run = processes.start("pendulum_bags", *command, "--bag", bag, alone=True)
+    assert run.wait(120.0) == 0, run.output
+    noise = NoiseSettings(1, default_amplitude("cart_pole"), 0.01, 0.2)
+    alone = simulate(JointSettings("cart_pole", noise=noise, simulation=str(model)).run("sim"))
+    with read_bag(bag) as opened:
+        states = opened.joints("/sim/joint_states")
+    assert states.names == ("cart", "pole")
+    assert np.array_equal(states.position, alone.position)
+    assert np.array_equal(states.velocity, alone.velocity)
+    assert np.ptp(states.position, axis=0).min() > 0.0
+    refused = processes.start("pendulum_bags", *command, "--q", "1", "1", "--bag", bag, alone=True)
+    assert refused.wait(60.0) == 2
+    assert "--q is for a plant of one joint, and cart_pole has several" in refused.output

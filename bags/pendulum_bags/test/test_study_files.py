@@ -13,7 +13,8 @@ from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RegulationSettings
-from pendulum_bags.studies.study_file import load_study, shipped_studies
+from pendulum_bags.studies.results import group_runs, groups_to_json
+from pendulum_bags.studies.study_file import AXES, load_study, shipped_studies
 from pendulum_lqr.policies.policy_file import write_policy
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
@@ -92,6 +93,19 @@ def test_matrix_is_the_product_of_all_axes_in_their_order(tmp_path: Path) -> Non
     assert [run.labels["seed"] for run in runs[:6]] == [4, 4, 5, 5, 6, 6]
     assert runs[-1].spec is not None
     assert (runs[-1].spec.side, runs[-1].spec.controller, runs[-1].spec.theta) == ("hw", "pid", 0.0)
+
+
+def test_runs_of_several_joints_have_no_metrics_and_are_grouped_all_the_same() -> None:
+    labels = dict.fromkeys(AXES, "a")
+    records = [{"labels": {**labels, "seed": seed}, "status": "done"} for seed in (1, 2)]
+    (group,) = group_runs(records)
+    assert (group.seeds, group.values, group.failed) == ((1, 2), {}, 0)
+    assert groups_to_json([group])[0]["runs"] == 2
+
+
+def test_weights_of_one_joint_are_refused_for_several_before_anything_runs() -> None:
+    with pytest.raises(ParameterError, match=r"q is \[100.0, 0.01\] for cart \[m\], pole \[rad\]; expected weights of"):
+        RunSpec(plant="cart_pole", design_plant="cart_pole", controller_parameters={"q": [100.0, 0.01]})
 
 
 def test_random_starts_follow_the_seed_alone(tmp_path: Path) -> None:

@@ -45,6 +45,11 @@ def swing_up(
     from pendulum_lqr.swing_up.trajectory import SwingUpSearch, cheapest_swing_up, write_trajectory
     from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 
+    plant = load_mechanism(preset)
+    if plant.is_pendulum:
+        raise ParameterError(
+            f"plant {plant.name!r} has one joint; expected several: energy_swing_up and time_optimal follow no file"
+        )
     try:
         values = IlqrWeights(*(float(part) for part in weights.split(",")))
     except (TypeError, ValueError) as error:
@@ -54,7 +59,7 @@ def swing_up(
         ) from error
     with writing(f"trajectory {output}", ParameterError):
         output.parent.mkdir(parents=True, exist_ok=True)
-    catch = default_catch(load_mechanism(preset))
+    catch = default_catch(plant)
     search = SwingUpSearch(values, duration=duration)
     console = make_console(highlight=False)
     with counting_bar(console) as bar:

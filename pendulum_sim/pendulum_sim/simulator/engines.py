@@ -136,6 +136,11 @@ def _make_gymnasium(values: Mapping[str, Any]) -> Simulation:
     env, mapping = values["env"], values["mapping"]
     if not env:
         raise ParameterError("env is missing; expected -p env:=ID, such as Pendulum-v1")
+    if values.get("plant"):
+        raise ParameterError(
+            f"environment {env} has one joint, and {values['plant']} several; expected a plant of one joint, or a "
+            "model file"
+        )
     adapter = load_adapter(mapping) if mapping else None
     with in_one_sentence(f"environment {env}", "loading", ParameterError):
         plant = load_gymnasium_plant(env, adapter, seed=values["seed"], effort_limit=values["effort_limit"])

@@ -36,6 +36,7 @@ from pendulum_bags.commands.whole_run import (
 )
 from pendulum_bags.experiments.domain import check_domain
 from pendulum_bags.experiments.graph_plant import PREFIX as GRAPH_PREFIX
+from pendulum_bags.experiments.joint_run import JointSettings, default_amplitude, design_file
 from pendulum_bags.experiments.operator import ask_for_running, confirmed
 from pendulum_bags.experiments.plant_options import (
     AcceptDifferences,
@@ -220,6 +221,7 @@ def thesis(
 
 @app.command()
 def lockstep(
+    context: typer.Context,
     bag: Annotated[Path, typer.Option(help="Folder of the bag; it must not exist.")],
     side: Annotated[str, typer.Option(help="sim for the simulator, hw for the emulated hardware.")] = "sim",
     plant: SimulatedPlant = None,
@@ -242,6 +244,9 @@ def lockstep(
 ) -> None:
     """Record one plant under control and noise, as fast as the loop allows; two runs with one seed are identical.
 
+    Of several joints the emulated hardware (--side hw) has the values of --plant, and the noise is by default a tenth
+    of the first motor's limit.
+
     Example: python -m pendulum_bags experiment lockstep --bag /tmp/seed_7 --seed 7
     """
     from pendulum_bags.experiments.host_pool import shared_pool
@@ -253,17 +258,35 @@ def lockstep(
         raise ParameterError(
             f"simulation is {simulation}, which runs already; expected one that this command starts, in its own time"
         )
-    settings = RegulationSettings(
-        plant=plant or "thesis",
-        simulation=simulation,
-        mapping=str(mapping or ""),
-        effort_strategy=strategy,
-        controller=controller,
-        q=q,
-        r=r,
-        noise=NoiseSettings(seed, amplitude, hold_time or (0.002 if side == "sim" else 0.01), duration),
-        storage=storage,
-    )
+    settings: RegulationSettings | JointSettings
+    if plant is not None and is_mechanism(plant):
+        if typed := typed_options(context, _OF_ONE_JOINT):
+            raise ParameterError(f"{typed[0]} is for a plant of one joint, and {plant} has several")
+        largest = amplitude if typed_options(context, {"amplitude"}) else default_amplitude(plant)
+        settings = JointSettings(
+            plant,
+            noise=NoiseSettings(seed, largest, hold_time or 0.01, duration),
+            storage=storage,
+            controller=controller,
+            simulation=simulation,
+            mapping=str(mapping or ""),
+        )
+        if settings.foreign is not None and not accept_differences:
+            settings.foreign.require_equation()
+        refuse_existing(bag)
+        settings = replace(settings, design=design_file(bag.parent / "logs" / bag.name, plant))
+    else:
+        settings = RegulationSettings(
+            plant=plant or "thesis",
+            simulation=simulation,
+            mapping=str(mapping or ""),
+            effort_strategy=strategy,
+            controller=controller,
+            q=q,
+            r=r,
+            noise=NoiseSettings(seed, amplitude, hold_time or (0.002 if side == "sim" else 0.01), duration),
+            storage=storage,
+        )
     if plant is None and (made := equation_file(settings.foreign, bag, accept_differences=accept_differences)):
         refuse_existing(bag)
         settings = replace(settings, plant=made)

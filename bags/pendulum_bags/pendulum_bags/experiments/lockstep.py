@@ -53,7 +53,7 @@ _PUBLISHED_EACH_STEP = (names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_E
 
 def run_lockstep(
     bag: Path,
-    settings: RegulationSettings,
+    settings: RegulationSettings | JointSettings,
     *,
     side: str = "sim",
     domain: int | None = None,

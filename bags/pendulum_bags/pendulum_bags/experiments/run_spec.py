@@ -125,6 +125,9 @@ class RunSpec:
         design = load_mechanism(self.design_plant)
         known = controller_parameters(self.controller, design)
         validate(known, self.law(design), where=f"controller {self.controller}")
+        weights, joints = self.controller_parameters.get("q"), design.coordinates.with_units
+        if isinstance(weights, (list, tuple)) and not design.is_pendulum and len(weights) < 2 * len(design.joints):
+            raise ParameterError(f"q is {list(weights)} for {joints}; expected weights of each position and velocity")
         own = {spec.name for spec in DISTURBANCE_SPECS} | _OF_THE_NODE
         reject_unknown(self.disturbance, own, where="disturbance")
         signal = {k: v for k, v in self.disturbance.items() if k not in _OF_THE_NODE}

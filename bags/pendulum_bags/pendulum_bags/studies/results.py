@@ -155,7 +155,7 @@ def group_runs(records: Sequence[Mapping[str, Any]]) -> list[Group]:
         values = {
             name: np.array([math.inf if m["metrics"][name] is None else m["metrics"][name] for m in done])
             for name in names
-            if done and all(name in m["metrics"] for m in done)
+            if done and all(name in m.get("metrics", {}) for m in done)
         }
         seeds = tuple(int(member["labels"]["seed"]) for member in done)
         found.append(Group(dict(zip(AXES, key, strict=True)), seeds, values, len(members) - len(done)))
