@@ -97,7 +97,7 @@ def draw_plant(seed: int) -> PlantParameters:
     prior = load_plant("dfki")
 
     def far(factor: float) -> float:
-        # Never so near to the published values that nothing has to be identified.
+        # Far enough from the published values.
         return float(factor ** (generator.uniform(0.4, 1.0) * generator.choice([-1.0, 1.0])))
 
     factors = {"inertia": far(1.25), "gravity": far(1.25), "damping": far(2.0)}

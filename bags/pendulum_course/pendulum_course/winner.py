@@ -57,7 +57,7 @@ def spread_on_machine(bag: Path, r: float, seed: int, hosts: HostPool | None = N
     try:
         recorded = record_run(bag, spec, hosts=hosts)
     except PlantStoppedError as error:
-        # The bridge's own fault is a result; a stop from outside, or a program that did not start, is not.
+        # Only the bridge's own fault is a result.
         if error.mode == "fault":
             return math.inf
         raise

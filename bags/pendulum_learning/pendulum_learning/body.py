@@ -369,7 +369,7 @@ def _kernel(goal: tuple[float, ...], prepare: Any, forward: Any) -> Any:
             held, pending, arrives = load(row, 3 * n), load(row, 4 * n), row[5 * n]
             push, newest = load(pushes[j], 0), load(efforts[j], 0)
             first = min(max(arrives, 0.0), period)
-            # No command overtakes the one before it, and none is later than two periods.
+            # Commands stay in order, at most two periods late.
             comes = min(max(late[j], arrives), 2.0 * period)
             second = min(max(comes, first), period)
             for part in range(3):

@@ -153,7 +153,6 @@ class SwingUp:
         self._astray[rows] = False
         kind = draw.uniform(0.0, 1.0, (size, 1))
         anywhere = draw.uniform(-self._furthest, self._furthest, (size, n))
-        # Hanging is equally far from upright in both directions.
         hanging = np.where(self._turns, self._goal, -self._goal)
         position = np.where(kind < 0.5, anywhere, np.where(kind < 0.75, hanging, 0.0))
         self.motion[rows] = 0.0

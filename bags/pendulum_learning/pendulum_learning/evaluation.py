@@ -102,7 +102,6 @@ def _drawn(policy: Policy, task: SwingUpTask, rng: np.random.Generator) -> Plant
 
 def plant_of(parameters: PlantParameters, period: float) -> JointPlant:
     """Return the simulated plant, whose states are tuples; ``period`` in [s]."""
-    # A mechanism gets the substeps of the simulator's own period.
     substeps = None if parameters.is_pendulum else max(1, round(period / 0.002))
     return make_plant(parameters, period, substeps=substeps)
 
@@ -125,7 +124,6 @@ def is_up(policy: Policy, trial: Trial, rows: NDArray[np.float64]) -> NDArray[np
     """Return at which steps of :func:`run_trial` turning joints are up and sliding ones never left their travel."""
     up = np.ones(rows.shape[1], dtype=np.bool_)
     for joint, row in zip(policy.coordinates.joints, np.abs(rows), strict=False):
-        # A trial that leaves the track does not count as up before that either.
         up &= row <= UP if joint.turns else bool(np.all(row <= trial.travel))
     return up
 

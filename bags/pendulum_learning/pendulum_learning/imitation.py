@@ -59,7 +59,6 @@ class Imitation:
             for part in range(_PARTS):
                 rows = order[part * size : (part + 1) * size]
                 answers, right = self.actor.forward(seen[rows]), taught[rows]
-                # Commands beyond the limit are clipped to it.
                 enough = (np.abs(right) >= 1.0) & (answers * right >= 1.0)
                 error = np.where(enough, np.float32(0.0), answers - right)
                 losses.append(float(np.mean(error * error)))

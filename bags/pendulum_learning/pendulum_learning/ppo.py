@@ -128,7 +128,7 @@ class Ppo:
             actions[k] = means[k] + spread * noise
             rewards[k], overs[k] = env.step(np.clip(actions[k], -1.0, 1.0))
             if overs[k].any() or k == t - 1:
-                # The end of the time is no end of the task: the value of the state reached counts on.
+                # A time limit does not end the task: bootstrap from the last value.
                 after[k] = self.critic.forward(np.concatenate(env.observe(), axis=1))[:, 0]
                 env.restart(overs[k])
             if k:
@@ -157,7 +157,7 @@ class Ppo:
             self._adam_critic.step(self.critic.backward(error / np.float32(size)), rate)
             return float(np.mean(error * error))
 
-        # Actor and critic share no numbers, so a thread for each gives the same bits as one for both.
+        # Actor and critic share nothing: two threads give the same bits.
         with ThreadPoolExecutor(1) as beside:
             for _ in range(s.epochs):
                 order = self.generator.permutation(len(seen))
@@ -181,7 +181,6 @@ class Ppo:
         ratio = np.exp(_log_chance(old.actions, mean, self.log_spread) - old.chance)
         blocked = ((gain > 0.0) & (ratio > 1.0 + s.clip)) | ((gain < 0.0) & (ratio < 1.0 - s.clip))
         weight = np.where(blocked, np.float32(0.0), -gain * ratio) / np.float32(size)
-        # A mean far beyond the clip of the actions would never return.
         beyond = np.clip(mean, -1.1, 1.1)
         slope = weight * deviation / variance + np.float32(0.02 / size) * (mean - beyond)
         spread_slope = np.sum(weight * (deviation * deviation / variance - 1.0), axis=0)

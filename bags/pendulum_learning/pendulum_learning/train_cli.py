@@ -135,7 +135,6 @@ def _settings(
     from pendulum_msgs_py.plants.plant_parameters import load_plant_file
 
     if task == "pendulum_v1":
-        # Few and long steps: an episode has 200, and is all but over after the swing-up.
         ppo = PpoSettings(hidden=hidden, discount=0.95, epochs=8, batches=8)
         settings = Training(task=task, swing_up=swing_up, ppo=ppo, environments=256, updates=80, seed=seed)
     else:

@@ -72,7 +72,6 @@ def program_hash() -> str:
     digest = hashlib.sha256()
     for package in ANSWERING:
         folder = Path(str(resources.files(package)))
-        # Margins and presets of plants are no modules.
         for file in sorted(file for file in folder.rglob("*") if file.is_file() and file.suffix != ".pyc"):
             digest.update(f"{package}/{file.relative_to(folder)}".encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()

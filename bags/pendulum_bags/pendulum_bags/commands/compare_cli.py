@@ -128,7 +128,7 @@ def compare(
 
     margins = Margins.of(margins_file, margin)
     readings: Sequence[Reading] = ()
-    # What was guessed is shown where it ends in an error, too.
+    # Guesses are shown even if an error follows.
     with ExitStack() as guesses, CachedBags() as bags:
         if all((path / "sim").is_dir() and (path / "hw").is_dir() for path in paths):
             run = partial(compare_folders, paths, margin=margins)
@@ -154,7 +154,7 @@ def compare(
         if joints or joint:
             if machine or design:
                 raise DataError("--machine and --design are of plants of one joint; expected neither for several")
-            # Bags of one joint are closed one by one: of a hundred runs not all need be open.
+            # Bags of one joint are closed one by one.
             run = partial(run, open_bag=bags)
             run = partial(run, joints=joints) if readings else run
             results = {name: run(joint=name) for name in ([joint] if joint else joints)}

@@ -316,14 +316,13 @@ def examples(
     """
     from pendulum_bags.experiments.lockstep import run_lockstep
 
-    # Two runs give the same messages, field by field, so a change of an example is a change of the programs.
+    # Runs are reproducible: a changed example shows changed programs.
     settings = RegulationSettings(noise=NoiseSettings(seed=1, hold_time=0.01))
     out.mkdir(parents=True, exist_ok=True)
     for side in SIDES:
         with tempfile.TemporaryDirectory(prefix="pendulum_examples_") as scratch:
             target = out / f"regulation_{side}"
             recorded = run_lockstep(Path(scratch) / target.name, settings, side=side)
-            # Older ones are replaced when the new ones are whole.
             shutil.rmtree(target, ignore_errors=True)
             shutil.copytree(recorded, target)
             print(target)

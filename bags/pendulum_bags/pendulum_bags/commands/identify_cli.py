@@ -107,7 +107,7 @@ def identify(
 
     paths = [*data, *(held_out or [])]
     readings = readings_of(paths, _mappings(mapping, len(data), len(paths)), topic, dt)
-    # What was guessed is shown where it ends in an error, too.
+    # Guesses are shown even if an error follows.
     context.call_on_close(partial(show_guesses, make_console(stderr=True), readings, write_mapping))
     if plant is not None:
         _refuse_unheeded(context, "--plant", _FOR_SEVERAL_JOINTS)
@@ -186,7 +186,6 @@ def _mappings(given: Sequence[str] | None, recordings: int, total: int | None = 
             f"--mapping is given {len(given)} times for {recordings} recordings; expected once for all, "
             "or once for each"
         )
-    # Those to score are read as the last one, unless each has its own.
     return [*given, *[given[-1]] * (count - len(given))]
 
 
@@ -276,7 +275,6 @@ def _print_result(result: IdentificationResult, out: Path | None) -> None:
     if out is not None:
         console.print(f"wrote {out}", highlight=False)
         sentence, command = result.next_step(str(out))
-        # The command is on a line of its own, to be copied.
         console.print(f"{sentence}\n  {as_typed(command)}", markup=False, highlight=False, soft_wrap=True)
 
 
@@ -290,6 +288,6 @@ def _print_sentences(console: Console, sentences: Sequence[str]) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code: 0, 2 for an error, 3 for a fit not to be believed."""
-    # The matrices are small: threads of the linear algebra would only wait for one another.
+    # Small matrices: BLAS threads only slow them down.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     return cli_main(app, argv, name="python -m pendulum_bags identify")

@@ -147,7 +147,7 @@ def joints(
     if design and driven != 1:
         raise ParameterError(f"--design is for a plant with one driven joint; {simulated.name} has {driven}")
     if design:
-        # Before anything runs: a slip of the pen should not cost a minute.
+        # Checked before anything runs.
         on = design_for(simulated)
         read_designs(design, on, linearise(on))
     budget = budget_of(budget, contenders, seeds, joints=True)

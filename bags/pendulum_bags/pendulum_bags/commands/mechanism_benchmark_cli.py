@@ -67,7 +67,7 @@ def benchmark(
     started = time.monotonic()
     console.print(f"designing {', '.join(names)}, then {len(jobs)} runs", style="dim")
     bench = Bench(plant, tuple(names), seed, compiled=len(jobs) > _FEW)
-    # A process that is forked from this one has what is prepared here.
+    # Forked processes inherit this.
     prepare(bench)
     results = results_at_once(console, "runs", [partial(run_job, bench, job) for job in jobs], workers)
     rows = score_rows(names, jobs, results, trials)

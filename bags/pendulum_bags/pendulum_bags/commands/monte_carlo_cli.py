@@ -185,7 +185,6 @@ def _print(console: Console, settings: MonteCarlo, result: dict[str, Any]) -> No
     for name, values in quantiles.items():
         table.add_row(with_unit(name), *(f"{value:.5g}" for value in values.values()))
     console.print(table)
-    # Of several joints too many parameters are uncertain for a row.
     names = [*(uncertainty.shares if one else ()), "noise_seed", *(f"max_{joint}" for joint in joints)]
     formats = {"noise_seed": ".0f", **{f"max_{joint}": ".5f" for joint in joints}}
     headings = ("noise seed" if name == "noise_seed" else with_unit(name) for name in names)

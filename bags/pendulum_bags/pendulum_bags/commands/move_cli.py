@@ -38,7 +38,6 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 @app.command(
     epilog="Example: python -m pendulum_bags move upright --namespace /sim",
-    # A negative angle is no option.
     context_settings={"ignore_unknown_options": True},
 )
 def move(
@@ -74,7 +73,6 @@ def move(
         node = find_plant(orchestrator, namespace)
         plant = PlantClient(orchestrator, namespace, node)
         plant.wait_until_ready(_PATIENCE, controller=False, disturbance=False)
-        # What is on the graph by then has been met: the plant's own services are no older.
         orchestrator.spin(0.5)
         controlled = plant.has_controller()
         try:
@@ -122,13 +120,12 @@ def _move(plant: PlantClient, goal: str | float, *, controlled: bool, control: b
     if isinstance(goal, float):
         end = goal
     else:
-        # The nearest turn's goal, so that no cable is wound up.
+        # The nearest turn's goal: cables must not wind up.
         turns = round((where - (math.pi if goal == "upright" else 0.0)) / (2 * math.pi))
         end = 2 * math.pi * turns + (math.pi if goal == "upright" else 0.0)
     ramp = thesis_ramp(where, end)
     duration = ramp.duration
     if not plant.is_armed():
-        # From rest a controller would saturate, and the plant would refuse to arm.
         if controlled and plant.controller_is_active():
             print(f"{space}: deactivating the controller", flush=True)
             plant.switch_controller(on=False)

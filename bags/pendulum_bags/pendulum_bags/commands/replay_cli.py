@@ -67,7 +67,7 @@ def replay(
 
     result: InputReplay | ControllerReplay | JointReplay
     (reading,) = readings_of([recording], mapping, topic, dt, start, stop)
-    # What was guessed is shown where it ends in an error, too.
+    # Guesses are shown even if an error follows.
     context.call_on_close(partial(show_guesses, make_console(stderr=True), [reading], write_mapping))
     if controller:
         from pendulum_bags.replay.controller_replay import parse_values, replay_controller

@@ -143,7 +143,6 @@ def report(
         else:
             summary = _summary(alone) if alone and not margins.stated else None
             if summary is not None:
-                # What the run was judged by when it was recorded.
                 margins = Margins.parse(margin_of(summary))
             result = run(margin=margins, open_bag=bags)
             certified = carry_over(result, sources, machine, design or ())

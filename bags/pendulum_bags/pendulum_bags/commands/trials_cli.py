@@ -95,7 +95,7 @@ def _run(settings: TrialSettings, out: Path | None, domain: int | None, json_out
     from pendulum_bags.commands import identify_cli
     from pendulum_bags.experiments.trials import run_trials
 
-    # Checked first: a recording that cannot be evaluated is not worth machine time.
+    # Checked before the machine moves.
     if importlib.util.find_spec("statsmodels") is None:
         raise ModuleNotFoundError("No module named 'statsmodels'", name="statsmodels")
     check_domain(domain)

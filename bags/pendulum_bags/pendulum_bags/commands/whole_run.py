@@ -112,7 +112,7 @@ def run_whole(
             answer, answers = whole_answer(found)
             summary = _summary(experiment, found, answer, answers)
             write_json(folder / "summary.json", summary)
-            # Before the page, which takes seconds: Ctrl-C then loses no answer.
+            # Before the page: Ctrl-C then loses no answer.
             if json_output:
                 print(json_text(summary), flush=True)
             else:
@@ -123,7 +123,6 @@ def run_whole(
             except KeyboardInterrupt:
                 if found.interrupted:
                     raise
-                # The first leaves out the files of figures alone.
                 found.interrupted = True
                 write_whole_report(folder, summary, found, answer, answers)
         console.print(f"\nreport  {folder / 'report.html'}\nbags    {folder / 'sim'}, {folder / 'hw'}", soft_wrap=True)
@@ -142,7 +141,7 @@ def _summary(experiment: str, found: Findings, answer: Answer, answers: Sequence
     settings = given.settings
     return {
         **joints.get("", {"joints": joints}),
-        # The requested seed: where the first run is excluded, the comparison has that of a repeat.
+        # The requested seed; the comparison may have that of a repeat.
         "experiment": experiment,
         "hardware": settings.hardware,
         "seed": settings.noise.seed,

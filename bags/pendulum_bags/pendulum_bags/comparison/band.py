@@ -40,7 +40,7 @@ class SlowClock:
         self.band = band
         self.times = stamps
         steps = np.maximum(np.round(np.diff(stamps) / period), 1.0)
-        # States that are missing leave a gap, which the filter must not take for one step.
+        # Missing states leave a gap.
         self._index = np.concatenate(([0.0], np.cumsum(steps)))
         self._even = np.arange(self._index[-1] + 1.0)
         self._sections = _sections(band, 1.0 / period, "motion")

@@ -393,7 +393,6 @@ def _pool(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         elif key.startswith("std_"):
             pooled[key] = _pooled_std(values, [row[key.replace("std_", "mean_")] for row in rows], counts)
         elif key == "rate_hz":
-            # Samples per time, so it is the time by which a run counts.
             pooled[key] = _mean(values, [row["duration_s"] for row in rows])
         else:
             pooled[key] = _mean(values, counts)

@@ -65,7 +65,7 @@ def _check_sides(simulation: RunData, hardware: RunData) -> None:
             f"{simulation.source} is a recording of hardware and {hardware.source} one of the simulation; "
             "expected the simulation first"
         )
-    # A bag may hold both plants, so only equal motions prove the same recording.
+    # A bag may hold both plants: compare motions.
     if np.array_equal(simulation.window.position, hardware.window.position) and np.ptp(hardware.window.position) > 0.0:
         raise DataError(
             f"{simulation.source} and {hardware.source} hold one and the same recording; expected one of each plant"
@@ -113,7 +113,6 @@ def _check_seeds(runs: Sequence[RunData]) -> None:
         seed = record.get("seed")
         if seed is None:
             continue
-        # One seed is one signal, whatever its length.
         if str(seed) in seen:
             raise DataError(
                 f"{seen[str(seed)].source} and {run.source} have one seed ({seed}), so one and the "

@@ -176,7 +176,7 @@ def _poles(clock: SlowClock, motions: Array, inputs: Array, slowest: float) -> A
         found += [root for root in roots if root.imag > 1e-3 and 0.3 < abs(root) < 1.0]
     distinct: list[complex] = []
     for root in sorted(found, key=abs, reverse=True):
-        # Modes that nearly coincide explain the same.
+        # Nearly coincident modes are redundant.
         if all(abs(root - other) > 0.2 * (1.0 - abs(other)) + 0.02 for other in distinct) and len(distinct) < 3:
             distinct.append(root)
     return np.concatenate((real.astype(complex), np.array(distinct, dtype=complex) ** (1.0 / skip)))

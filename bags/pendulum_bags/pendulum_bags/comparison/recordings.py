@@ -290,7 +290,6 @@ def _best_shift(signals: Sequence[tuple[Signal, Signal]], ours: RunData, theirs:
         curves.append(curve)
     curve = np.mean(curves, axis=0) if curves else np.zeros(reach.size)
     curve[overlap < _LEAST_OVERLAP * min(times[0].size, times[1].size)] = -1.0
-    # Of shifts that fit as well, the one with most in common.
     good = np.flatnonzero(curve > curve.max() - 1e-3)
     longest = good[overlap[good] > 0.98 * overlap[good].max()]
     top = int(longest[np.argmax(curve[longest])])
@@ -316,7 +315,6 @@ def _correlations(a: Array, b: Array, reach: NDArray[np.int64]) -> tuple[Array, 
     covariance = summed(ones[0], others[0]) - sum_a * sum_b / n
     spread_a = np.maximum(summed(ones[1], others[2]) - sum_a**2 / n, 0.0)
     spread_b = np.maximum(summed(ones[2], others[1]) - sum_b**2 / n, 0.0)
-    # What hardly moves in the overlap shows nothing of the shift.
     seen = (spread_a > 0.02 * float(a @ a)) & (spread_b > 0.02 * float(b @ b))
     curve = np.asarray(covariance / np.sqrt(np.maximum(spread_a * spread_b, 1e-300)), dtype=float)
     return np.where(seen, curve, 0.0), n
@@ -373,7 +371,7 @@ def _is_copy(one: Series, other: Series) -> bool:
         for shift in (a.t[0] - b.t[0], a.t[-1] - b.t[-1], *_shifts_of_rows(a, b)):
             at = b.t + shift
             inside = (at >= a.t[0]) & (at <= a.t[-1])
-            # A motion that comes later than that of the other, after one and the same input, is another one.
+            # A later motion after the same input is another recording.
             if 2 * int(inside.sum()) >= b.t.size and all(
                 _same(np.interp(at[inside], a.t, x), y[inside])
                 for x, y in ((a.position, b.position), (a.effort, b.effort))

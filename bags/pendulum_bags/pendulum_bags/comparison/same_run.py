@@ -169,7 +169,7 @@ def paired_tests(
         if delay is None and first:
             continue  # nothing was taken out
         step = 2 if first == 0 else later
-        # With the delay left in, it grows so steeply with the phase that few runs do not show the mean over runs.
+        # With the delay left in, few runs do not show the mean: it grows steeply with the phase.
         used = kind if first else replace(kind, runs_differ=False)
         for index, (what, margin) in enumerate((("angle", margins.path_angle), ("velocity", margins.path_velocity))):
             tests.append(_path_test(runs, (first + index, first + index + step), f"{what}{note}", margin, used))
@@ -206,7 +206,7 @@ _LATE = 4
 
 
 def _values(motion: Series) -> Array:
-    # Around upright, so that squares do not drown the variance.
+    # Around upright, for numerical precision.
     return np.stack([motion.position - np.pi, motion.velocity, motion.effort], axis=1)
 
 
@@ -323,7 +323,6 @@ def _find_delay(seen: Sequence[_Seen]) -> float | None:
     None at an end of the searched range, or where they are hardly alike: beyond the range, noise has small peaks.
     """
     reach = LONGEST_DELAY - float(_LAGS[-1])
-    # Below its band, a velocity changes little within a coarse step.
     coarse = int(np.clip(0.1 / (seen[0].clock.band * LAG_STEP), 1.0, 10.0))
     end = round(reach / LAG_STEP)
     steps = np.append(np.arange(0, end, coarse), end)
@@ -399,7 +398,6 @@ def _no_delay(margins: Margins, kind: _Kind) -> EquivalenceTest:
     end = scale * LONGEST_DELAY
     interval = Interval(math.nan, -end, end, kind.looks.level, math.nan, 1)
     test = equivalence_test("delay", margin.unit, interval, -margin.value, margin.value, runs=kind.runs)
-    # However wide the margin, the delay may lie beyond the searched range.
     return replace(test, outcome=Outcome.UNDECIDED, more_runs=None, smallest_margin=math.nan)
 
 

@@ -42,10 +42,10 @@ def start_bound_process(
 
 def _set_priority(niceness: int) -> Callable[[], None]:
     def set_priority() -> None:
-        # Raising priority is a privilege; without it the run is as good as the machine is idle.
+        # Raising priority needs a privilege.
         with contextlib.suppress(PermissionError):
             os.nice(niceness)
-        # Where Linux shares the cores among sessions first (autogroup), the whole session changes priority.
+        # With Linux's autogroup the whole session changes priority.
         if now := os.getpriority(os.PRIO_PROCESS, 0):
             with contextlib.suppress(OSError):
                 Path("/proc/self/autogroup").write_text(str(now), encoding="ascii")

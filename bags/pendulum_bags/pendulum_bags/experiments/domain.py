@@ -28,7 +28,7 @@ def reserve_domain(requested: int | None = None) -> Iterator[int]:
     folder = Path(tempfile.gettempdir(), f"pendulum_domains_{os.getuid()}")
     folder.mkdir(exist_ok=True)
     if requested is not None:
-        # A file of its own: the holder of a reserved domain may run experiments in it, but one at a time.
+        # A second lock: the holder of a domain may run one experiment at a time.
         with (folder / f"{requested}.experiment.lock").open("w") as lock:
             try:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -62,7 +62,6 @@ def join(orchestrator: Orchestrator, space: str, coordinates: Coordinates = ONE_
     _refuse_others(orchestrator, space)
     client = PlantClient(orchestrator, space, node, joints=coordinates.names)
     client.wait_until_ready(_PATIENCE, controller=False, disturbance=False)
-    # Discovery is complete by then: node information is no older than services.
     orchestrator.spin(0.5)
     # The commander may be discovered later than the plant.
     _refuse_others(orchestrator, space)

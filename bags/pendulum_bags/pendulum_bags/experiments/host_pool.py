@@ -78,7 +78,7 @@ class HostedProgram:
                 heard = b""
             if not heard:
                 self._host.connection.close()
-                # Whatever the host's exit code is, the program has not reported success.
+                # The program has not reported success.
                 self.returncode = self._host.process.wait() or 1
                 return
             *lines, self._heard = (self._heard + heard).split(b"\n")
@@ -94,7 +94,7 @@ class HostedProgram:
         if rest == AGAIN:
             self._release(self._host)
         else:
-            # Anything that a program leaves behind, on the graph too, ends with its process.
+            # The process ends with all that its program left, on the graph too.
             _end([self._host])
 
 

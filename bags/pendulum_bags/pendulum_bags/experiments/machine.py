@@ -60,18 +60,17 @@ class Machine:
     ) -> None:
         self.interrupt()
         if kind is KeyboardInterrupt and self._child is not None:
-            # No hardware moves: a second interrupt ends it without further waiting.
+            # No hardware moves: a second interrupt ends it at once.
             with suppress(ProcessLookupError):
                 os.killpg(self._child.process.pid, signal.SIGKILL)
         if self._child is not None:
-            # It ends programs of its own, which a kill would leave behind.
+            # A kill would leave its own programs.
             with suppress(FaultError):
                 self._processes.wait(self._child, _ENDING)
         self._processes.stop()
 
     def interrupt(self) -> None:
         """Ask the program to end; leaving the context waits for that."""
-        # Once: a second signal would interrupt its end.
         if self._child is not None and not self._interrupted:
             self._interrupted = True
             self._child.process.send_signal(signal.SIGINT)
@@ -85,7 +84,6 @@ class Machine:
         self._busy.unlink(missing_ok=True)
         write_json(listed, [{"bag": str(run.bag.resolve()), "spec": run.spec.to_json()} for run in self.runs])
         command = [sys.executable, "-m", "pendulum_bags", "experiment", "run", str(listed)]
-        # In a domain of its own, different from the experiment's.
         self._child = self._processes.start(
             "machine", command, ends_by_itself=True, niceness=5, environment={"ROS_DOMAIN_ID": ""}
         )
@@ -140,7 +138,6 @@ class Machine:
         if self._child is not None:
             with self._child.log.open("rb") as log:
                 log.seek(self._read)
-                # A line that is still being written is read later.
                 *lines, rest = log.read().split(b"\n")
                 self._read = log.tell() - len(rest)
             for line in (one.decode(errors="replace") for one in lines):

@@ -114,7 +114,6 @@ def _saved_settings(machine: RealMachine, console: Console) -> Iterator[None]:
     finally:
         said = _lab("restore", str(machine.path), str(folder), "--yes")
         if said:
-            # The files remain: they are the only record of the module's settings.
             again = f"python -m pendulum_hw_bridge lab restore {machine.path} {folder}"
             words = f"the module's settings were not given back ({said}); again: {again}"
             console.print(words, markup=False, style="red")

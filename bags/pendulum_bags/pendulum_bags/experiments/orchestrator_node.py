@@ -118,7 +118,6 @@ class Orchestrator:
         """Handle what arrives within a duration [s], or until a future is done, without further checks."""
         began = time.monotonic()
         self._executor.spin_until_future_complete(Future(executor=None) if until is None else until, duration)
-        # A pause of this program does not count.
         self.listened += min(duration, time.monotonic() - began)
         for check in self.after_listening:
             check()
@@ -155,7 +154,6 @@ class PlantClient:
         node = orchestrator.node
         self._joints = joints
         self.orchestrator = orchestrator
-        # Names in the root namespace begin with one slash, too.
         self.namespace = namespace = namespace.rstrip("/")
         self.sample: JointSample | None = None
         self._foreign_joints: tuple[str, ...] = ()
@@ -224,7 +222,7 @@ class PlantClient:
         self.orchestrator.wait_for(
             f"a recorder on {topic}", lambda: (self.namespace or "/", names.RECORDER) in listeners(), timeout
         )
-        # Some never match: those that request old moves, or a deadline. The others match within moments.
+        # Subscribers with other QoS never match.
         deadline = time.monotonic() + _MATCHING
         while self._trajectory.get_subscription_count() < len(listeners()) and time.monotonic() < deadline:
             self.orchestrator.spin(_SLICE)

@@ -212,7 +212,7 @@ def start_recorder(
     command += ["--regex", f"^({namespace}/.*|/diagnostics|/clock)$", "--storage", storage]
     command += ["--metadata", str(metadata), "--log-time", "header" if simulated else "receive"]
     if simulated:
-        # Stamps of wall time do not belong in a bag of simulated time.
+        # No stamps of wall time in a bag of simulated time.
         command += ["--exclude", "^/diagnostics$|/transition_event$"]
     command += ["--ros-args", "-r", f"__ns:={namespace}"]
     if priority:

@@ -65,7 +65,6 @@ class PhaseProgress:
     def _tick(self) -> None:
         while not self._ended.wait(_TICK):
             elapsed = time.monotonic() - self._started
-            # Never past the end of the phase.
             self._bar.update(self._task, completed=self._done + min(elapsed, self._length))
             if self._name and not self._console.is_terminal and time.monotonic() - self._printed > _SILENCE:
                 self._console.print(f"  {self._name}: {elapsed:.0f} of {self._length:.0f} s", highlight=False)

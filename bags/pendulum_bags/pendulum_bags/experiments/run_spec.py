@@ -119,7 +119,7 @@ class RunSpec:
             object.__setattr__(self, "method", integrator_of(self.plant, self.method))
         for name, given in self.plant_parameters.items():
             for value in given if isinstance(given, (list, tuple)) else (given,):
-                # The node checks its own parameters, but a run is written down before it starts.
+                # Checked before the run is stored; the node checks again.
                 if isinstance(value, float) and not math.isfinite(value):
                     raise ParameterError(f"parameter {name} of the plant is {value}; expected a finite number")
         design = load_mechanism(self.design_plant)
@@ -254,7 +254,6 @@ class RunSpec:
         """Return the bag's metadata of its run."""
         values = self.to_json()
         foreign = self.foreign
-        # Identified by its contents, not by its path.
         del values["simulation"], values["mapping"]
         return {
             RUN_RECORD: {

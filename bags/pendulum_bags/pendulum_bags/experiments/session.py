@@ -77,7 +77,6 @@ class Session:
         ``states`` is the number of published states; ``published_each_step`` are relative names of topics with a
         message per step, one fewer than states: what a publisher sends before it has matched the recorder is lost.
         """
-        # The clock ticks once for each state, and no topic waits for another.
         expected = {f"{plant.namespace}/{names.JOINT_STATES}": states, names.CLOCK: states}
         expected |= {f"{plant.namespace}/{topic}": states - 1 for topic in published_each_step}
         RecorderClient(self.orchestrator, plant.namespace).wait_for_all(expected)

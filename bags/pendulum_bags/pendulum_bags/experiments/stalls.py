@@ -50,7 +50,7 @@ def run_undisturbed(run: Callable[[], None], folder: Path, *, emulated: bool, re
             if not emulated or not is_stall(error):
                 raise
             last = attempt == ATTEMPTS
-            # Recorded before anything is removed: a fault that only looks like a stall must not be selected away.
+            # Recorded before anything is removed: a fault may resemble a stall.
             write_stall(
                 folder, str(error), "" if not (folder / _LOGS).is_dir() else _LOGS if last else _logs_of(attempt)
             )

@@ -67,7 +67,6 @@ def run_thesis(
         session.drives(*plants)
         _regulate(session, plants, settings, progress, on_idle, rests)
         progress.phase("closing the bags", 2.0)
-        # Before any wait: messages from here on are no part of the experiment.
         for recorder in recorders:
             session.close(recorder)
         for plant in plants:
@@ -132,7 +131,6 @@ def _regulate(
     orchestrator.spin(max(0.0, max(durations) - _PAUSING))
     rests()
     _wait_for_goal(orchestrator, plants, durations)
-    # Upright, the plants hold their positions meanwhile.
     orchestrator.wait_for("other recordings to pause", rests, START_TIMEOUT)
 
     progress.phase("regulation", SETTLE_TIME)

@@ -127,7 +127,6 @@ class TrialSettings:
             return machine.bridge_program("direct_pwm", bag)
         parameters: dict[str, graph.ParameterArgument] = {"plant": self.plant, "effort_strategy": "direct_pwm"}
         if self.hardware == "emulator":
-            # Sensor noise differs from trial to trial, as on a real sensor.
             parameters.update(flat=self.kind.flat, seed=1000 * self.seed + trial)
             if self.lockstep:
                 # Ends by simulated time, too: a busy machine delays the orchestrator's view of the end.
@@ -227,7 +226,7 @@ def _topics(settings: TrialSettings) -> dict[str, int]:
         "actuator/feedback": 1,
     }
     if settings.kind.procedure == "hand":
-        # The real bridge has no such input: a real pendulum is pushed by hand.
+        # A real pendulum is pushed by hand.
         topics[names.PUSH] = 0 if settings.by_person else 2
     else:
         topics[names.JOINT_TRAJECTORY] = 2

@@ -50,7 +50,6 @@ def write_figures(figures: Sequence[Figure], folder: Path, formats: Sequence[str
             return []
         if len(figures) < _MANY:
             return _write(figures, folder, formats)
-        # The largest alternate between the two.
         ordered = sorted(figures, key=lambda figure: -len(figure.panels))
         ours, theirs = ordered[::2], ordered[1::2]
         other = get_context("spawn").Process(target=_write_aside, args=(theirs, folder, formats), daemon=True)

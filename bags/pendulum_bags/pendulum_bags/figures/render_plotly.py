@@ -111,7 +111,7 @@ def _add_marks(layout: dict[str, Any], panel: Panel, suffix: str) -> None:
         else:
             shape = {"y0": 0, "y1": 1, "yref": f"y{suffix} domain", "x0": mark.value, "x1": mark.value}
             shape["xref"] = f"x{suffix}"
-            # Towards the middle: on a phone there is no space behind a line near the right edge.
+            # Towards the middle: a phone has no space at the right edge.
             side = "right" if panel.x_range and mark.value > sum(panel.x_range) / 2.0 else "left"
             note = _note(mark.label, mark.value, 1.0, f"x{suffix}", f"y{suffix} domain", side, "top")
         layout["shapes"].append({"type": "line", "line": line, **shape})

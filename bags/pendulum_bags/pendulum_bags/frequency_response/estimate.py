@@ -144,7 +144,7 @@ def _joint(record: Record, frequency: Array, r: Complex, u: Complex, y: Complex,
     deviation = np.sqrt(variance * power_r * y.shape[1] / blocks) / np.abs(cross_ur)
     power_y = np.sum(np.abs(y) ** 2, axis=1)
     coherence = np.abs(cross_yr) ** 2 / np.maximum(power_y * power_r, 1e-300)
-    # Rounding in noiseless runs must not claim certainty beyond that of the numbers.
+    # Rounding limits the certainty of noiseless runs.
     floor = 1e-9 * np.abs(response)
     return MeasuredResponse(
         record.label,
@@ -166,7 +166,7 @@ def _distortion(y: Complex, harmonics: NDArray[np.int64]) -> tuple[float, float]
     excited = harmonics[harmonics <= top]
     if odd.size < 2:
         return np.nan, np.nan
-    # Noise is averaged away: only what repeats from period to period is distortion.
+    # Only what repeats from period to period is distortion.
     mean = np.mean(y, axis=1)
     noise = np.mean(np.abs(y - mean[:, None, :]) ** 2, axis=1) / max(1, y.shape[1] - 1)
     there = np.mean(np.maximum(np.abs(mean[:, odd]) ** 2 - noise[:, odd], 0.0), axis=1)

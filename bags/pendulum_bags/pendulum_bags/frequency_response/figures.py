@@ -37,7 +37,6 @@ def response_figures(analysis: Analysis) -> list[Figure]:
     if certifier is not None:
         figures.append(gap_figure(certifier, analysis.difference, designs))
         figures += [_nyquist(certifier, design) for design in designs[:1] if design.K is not None]
-        # Several joints have too many gains for a map.
         if not analysis.responses[0].joints:
             figures += [certified_weights_figure(certifier, analysis.model), certified_gains_figure(certifier, designs)]
     return figures

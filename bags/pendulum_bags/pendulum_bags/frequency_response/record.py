@@ -81,7 +81,6 @@ def record_of_joints(runs: Mapping[str, RunData], driven: str) -> Record:
 
 
 def _record(run: RunData, motions: Sequence[RunData]) -> Record:
-    # A reference that moves excites a loop as a disturbance does.
     followed = run.followed if run.followed is not None and np.ptp(run.followed.value) > 0.0 else None
     excitation = run.disturbance if run.disturbance is not None else followed
     for signal, what in ((excitation, "disturbance"), (run.applied, "applied torque")):

@@ -68,7 +68,7 @@ def write_analysis(
     """Write responses, layers, numbers, figures and a page; ``step`` gets each name; return the page."""
     write_numbers(folder, analysis)
     step("drawing")
-    # Thousands of small matrices: more threads of the linear algebra would only slow each other down.
+    # Thousands of small matrices: BLAS threads only slow them down.
     with threadpool_limits(1):
         figures = name_in(response_figures(analysis), emulated=analysis.is_emulated)
     write_figures(figures, folder / "figures", formats)

@@ -262,7 +262,7 @@ def timing(data: ReportData) -> Figure:
     pair = data.comparison.pairs[0]
     panels, words = [], []
     for label, role, run in (("simulation", "sim", pair.simulation), ("hardware", "hw", pair.hardware)):
-        # Rounded to nanoseconds: in lockstep all intervals are one, and an axis would enlarge what floats round off.
+        # Rounded to nanoseconds: an axis would enlarge rounding errors of equal intervals.
         stamped, arrived = np.round(1e3 * np.diff(run.window.t), 6), np.round(1e3 * run.arrival, 6)
         traces = [Trace(*_distribution(arrived), "arrival at the recorder", role, "step")] if arrived.size else []
         traces.append(Trace(*_distribution(stamped), "stamps", "difference", "step"))
@@ -300,7 +300,7 @@ def pooled_runs(data: ReportData) -> Figure | str:
                 ("hardware", "hw", [pair.hardware for pair in pairs]),
             )
         ]
-        # There is no run 1.5.
+        # Integer ticks only.
         panels.append(Panel("run", unit, traces, x_range=(0.5, number.size + 0.5), x_step=math.ceil(number.size / 10)))
     spreads = [pair.hardware.window.position.std(ddof=1) for pair in pairs]
     total = sum(effective_size(pair.hardware.window.position) for pair in pairs)

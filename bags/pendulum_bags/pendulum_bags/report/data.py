@@ -67,7 +67,6 @@ class ReportData:
         try:
             return load_plant(str(self.run.get("plant", "thesis")))
         except ParameterError:
-            # The file that the run was made with is gone: figures of the model are left out, with this reason.
             return None
 
 

@@ -36,7 +36,7 @@ def _certified(draw: Callable[[Analysis, Certifier], Figure]) -> Maker:
         found = data.certified
         if found is None or found.certifier is None:
             return "needs the hardware's measured response (python -m pendulum_bags experiment frequency_response)"
-        # Thousands of small matrices: threads of the linear algebra would only get into each other's way.
+        # Thousands of small matrices: BLAS threads only slow them down.
         with threadpool_limits(1):
             return draw(found, found.certifier)
 

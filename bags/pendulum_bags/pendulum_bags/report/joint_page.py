@@ -30,7 +30,6 @@ _Shown = TypeVar("_Shown", Figure, Table)
 def joint_page(comparisons: Mapping[str, Comparison], answer: Answer, *, title: str) -> Page:
     """Return the page of the comparisons of at least one joint, by name."""
     first = next(iter(comparisons.values()))
-    # The bag's metadata of its run hold for all joints.
     data = ReportData(first, {"seed": seed_of(first.pairs[0].simulation)}, answer=answer)
     differences = joint_differences(comparisons)
     figures = [

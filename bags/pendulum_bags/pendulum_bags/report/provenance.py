@@ -33,7 +33,6 @@ def provenance_table(data: ReportData) -> Table:
     summary, run = data.summary, data.run
     revision = str(run.get("git_revision") or summary.get("git_revision") or "unknown")
     rows: list[tuple[str, str]] = [
-        # Of several runs each has its own below.
         *([("seed", str(summary.get("seed", "unknown")))] if len(data.comparison.pairs) == 1 else []),
         ("effort strategy", str(summary.get("strategy", "unknown"))),
         ("revision", revision),
@@ -69,7 +68,6 @@ def provenance_table(data: ReportData) -> Table:
 def _runs(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
     """Return the bags of every run; for several also seed, command, revision and versions."""
     rows = []
-    # That of the first run is listed already.
     commands = {"", str(run_record(pairs[0].simulation.metadata).get("command", ""))}
     for number, pair in enumerate(pairs, start=1):
         of = f"run {number}, " if len(pairs) > 1 else ""
@@ -164,7 +162,6 @@ def _emulated_plant(run: RunData, open_bag: OpenBag) -> PlantParameters | None:
             if status.name.startswith(space) and pair.key == PLANT_PARAMETERS
         )
         plants = read_plants(next(texts, "[]"))
-    # The page is made without this table, too.
     except (BagError, DataError, ParameterError):
         return None
     return next((plant for plant in plants if plant.drivetrain), None)

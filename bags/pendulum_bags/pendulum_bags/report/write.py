@@ -101,7 +101,6 @@ def write_joint_report(
 def _save(out: Path, page: Page, formats: Sequence[str]) -> Path:
     """Write the figures, then the page with the figures for print."""
     figures = [name_in(figure, emulated=page.emulated) for figure in page.figures]
-    # Paper has no scripts: a printed page has these pictures.
     drawn = write_figures(figures, out / "figures", formats)
     text = render_page(page, {path.stem: _for_paper(path) for path in drawn if path.suffix == ".png"})
     target = out / "report.html"
@@ -116,7 +115,6 @@ def _for_paper(path: Path) -> bytes:
 
     buffer = io.BytesIO()
     with Image.open(path) as picture:
-        # The default way to choose colours takes twice as long, and misses some by more.
         picture.convert("RGB").quantize(32, Image.Quantize.MAXCOVERAGE).save(buffer, "PNG", optimize=True)
     return buffer.getvalue()
 

@@ -130,7 +130,6 @@ class Recording:
     @property
     def name(self) -> str:
         """Short name for messages and figures: that of the source file."""
-        # (a bag given as `.` has a name, too)
         return Path(self.source or "recording").resolve().name
 
     @property
@@ -209,7 +208,7 @@ def data_notes(recording: Recording) -> list[str]:
         )
     if recording.meta.get("no_torque"):
         notes.append("the recorded torque is 0 throughout: it is taken for a free swing.")
-    # Behind a clock that stepped back the recording goes on after a gap that nothing lasted.
+    # After a backward step of the clock the recording resumes behind a gap.
     made = gap_length(recording.time) if recording.meta.get("clock_notes") else -1.0
     notes.extend(
         f"no samples for {stop - start:.2f} s from {start:.2f} s after its start: no window reaches across."
@@ -260,7 +259,7 @@ def unwrap(recording: Recording) -> Recording:
     position = recording.position
     jumps = np.abs(np.diff(position)) > np.pi
     result = recording
-    # Wrapped angles stay within one turn; what leaves it has been counted on, and jumps for another reason.
+    # Wrapped angles stay within one turn.
     if jumps.any() and np.ptp(position) <= 2.0 * np.pi * 1.01:
         position = np.unwrap(position)
         meta = {**recording.meta, "unwrapped": int(jumps.sum())}

@@ -19,7 +19,7 @@ def bags_below(folder: Path, suffixes: Collection[str] = ()) -> Iterator[Path]:
         yield folder
         return
     for path in sorted(folder.iterdir()):
-        # Links may lead round in a circle, hidden folders are somebody's scratch.
+        # Links may form cycles; hidden folders are scratch.
         if path.is_dir() and not path.is_symlink() and not path.name.startswith("."):
             yield from bags_below(path, suffixes)
         elif path.suffix.lower() in suffixes:

@@ -116,5 +116,4 @@ def _words(record: Mapping[str, Any]) -> list[str]:
         words = shlex.split(str(record.get("command", "")))
     except ValueError:  # a quote without its end: by hand
         return []
-    # The program that lists all others starts those of this package by their names.
     return ["python", "-m", "pendulum_bags", *words[2:]] if Path("".join(words[1:2])).name == "pendulum" else words

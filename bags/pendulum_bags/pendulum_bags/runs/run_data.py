@@ -288,7 +288,7 @@ def read_run(
     )
     if reading.start is None and reading.stop is None:
         return run
-    # The part that was chosen counts from the beginning of the recording, as of a file.
+    # The chosen part counts from the start of the recording.
     part = times[reading.rows(times)]
     return run.between(max(part[0], window.t[0]), min(part[-1], window.t[-1]) + 0.5 * whole.period)
 
@@ -444,11 +444,10 @@ def _optional(
 def _answers(stamps: NDArray[np.int64], commands: NDArray[Any] | None, otherwise: NDArray[Any]) -> NDArray[np.float64]:
     """Return the torque that the controller returned for each state, else the newest."""
     if commands is None:
-        # A recording without commands still has the measured torque.
         return np.nan_to_num(otherwise)
     index = np.searchsorted(commands["stamp_ns"], stamps, side="right") - 1
     held = np.where(index >= 0, commands["effort"][np.maximum(index, 0)], 0.0)
-    # Long after the last command nobody commands any more.
+    # Long after the last command there is no commander.
     age = (stamps - commands["stamp_ns"][np.maximum(index, 0)]) / NANOSECONDS
     return np.where((index >= 0) & (age < 0.1), held, 0.0)
 

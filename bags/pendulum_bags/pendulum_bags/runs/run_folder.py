@@ -120,7 +120,6 @@ def read_stalls(folder: Path) -> list[dict[str, str]]:
     except FileNotFoundError:
         return []
     except (OSError, ValueError, KeyError, TypeError) as error:
-        # A damaged record must not look like a run without any.
         return [{"reason": f"{_STALLS} cannot be read ({type(error).__name__})", "logs": ""}]
 
 

@@ -169,7 +169,6 @@ def shared_span(*series: Series) -> tuple[float, float]:
 def uniform_times(start: float, stop: float, period: float) -> Array:
     """Return times from ``start`` to at most ``stop`` at a fixed period [s]."""
     count = int(np.floor((stop - start) / period + 1e-6)) + 1
-    # Rounding must not put the last one behind the end.
     return np.minimum(start + period * np.arange(count, dtype=float), stop)
 
 

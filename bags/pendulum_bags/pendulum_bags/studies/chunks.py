@@ -135,7 +135,7 @@ def _on_cluster(
 ) -> Iterator[tuple[int, Result]]:
     from distributed import KilledWorker, as_completed
 
-    # Cores belong to the cluster's workers: a piece that took all of them would fight its neighbours.
+    # The cores are shared by the cluster's workers.
     jobs = {client.submit(task, job, number, 1, pure=True): number for number in numbers}
     try:
         for future, result in as_completed(jobs, with_results=True):

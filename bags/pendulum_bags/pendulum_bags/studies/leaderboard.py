@@ -223,7 +223,7 @@ def evaluate(
 ) -> Entry:
     """Return the line of a controller for ``duration`` [s] from hanging to upright, on its own plant."""
     true = load_plant(plant)
-    # Hanging exactly down is an equilibrium that no torque of an energy controller leaves.
+    # Hanging at rest is an equilibrium of an energy controller.
     spec: dict[str, Any] = {
         "plant": plant,
         "design_plant": plant,

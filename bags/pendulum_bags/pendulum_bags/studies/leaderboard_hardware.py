@@ -51,7 +51,7 @@ def arrays_of_bag(bag: Path, namespace: str) -> RunArrays:
 
 
 def _model_error(folder: Path, _duration: float) -> Sequence[Mapping[str, Any]]:
-    # The machine stays; the controller is designed on a wrong model of it.
+    # The controller is designed on a wrong model of the machine.
     found = []
     for number, changed in enumerate(model_errors(load_plant(_PLANT))):
         path = folder / f"design_{number}.yaml"

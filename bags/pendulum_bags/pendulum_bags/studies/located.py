@@ -35,7 +35,7 @@ class LocatedMapping:
         """Read a file; a ParameterError if it cannot be read, is no safe YAML, or holds no mapping."""
         values = load_yaml(path, what)
         lines: dict[Trail, int] = {}
-        # The strict loader has accepted this very text, so composing it again meets nothing unsafe.
+        # The strict loader has accepted this text.
         root = yaml.compose(read_text(path, what), Loader=yaml.SafeLoader)
         _collect(root, (), lines)
         return cls(values, path, lines)

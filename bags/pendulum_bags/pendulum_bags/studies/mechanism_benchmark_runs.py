@@ -202,7 +202,7 @@ def simulate(
     driven = plant.coordinates.driven[0]
     rng = np.random.default_rng(seed)
     age = int(what.delay / DT)
-    # By steps, so that more of one kind of noise leaves the others as they are.
+    # By steps, so that more noise of one kind leaves the others unchanged.
     noise = what.velocity_noise * rng.standard_normal((steps, 2)) if what.velocity_noise else None
     shake = what.torque_noise * rng.standard_normal((steps, 2)) if what.torque_noise else None
     q: Vector = (0.0, 0.0)
@@ -281,7 +281,7 @@ def robustness_trials(plant: PlantParameters, seed: int = 1) -> list[Trial]:
 def try_once(plant: PlantParameters, stepper: Stepper, controller: Controller, trial: Trial) -> bool:
     """Return whether a run ends upright: within 0.35 rad and 1 rad/s of each joint."""
     controller.reset()
-    # Added up, 5000 times 2 ms stay a little below 10 s, and the public loop takes one step more.
+    # 5000 sums of 2 ms stay below 10 s, so the public loop takes one step more.
     steps = round(DURATION / DT) + 1
     run = simulate(plant, stepper, _answering(plant, controller), steps, trial.disturbances, trial.seed)
     end = run.states[-1]

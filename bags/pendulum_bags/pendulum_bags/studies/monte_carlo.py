@@ -195,7 +195,6 @@ def run_monte_carlo(
             f"folder {folder} holds a Monte Carlo of {before} runs; expected at most the {settings.runs} of this one"
         )
     if before < settings.runs:
-        # Only a last chunk that was not full has to be carried out again.
         if before % settings.chunk:
             chunk_path(folder, before // settings.chunk).unlink(missing_ok=True)
         write_results_marker(folder, fingerprint, content)
@@ -218,7 +217,7 @@ def _figures(folder: Path, settings: MonteCarlo) -> dict[str, Any]:
             parts[name].append(column)
     values = {name: np.concatenate(pieces) for name, pieces in parts.items()}
     farthest = np.max([values[name] for name in names.farthest], axis=0)
-    # What is not a number is not inside, and worse than any number.
+    # NaN counts as outside, and as the worst.
     inside = int((farthest <= settings.bound).sum())
     worst = np.argsort(farthest, kind="stable")[::-1][:_WORST]
     ends: Any = [values[name] for name in names.end]
@@ -271,7 +270,7 @@ def sobol(settings: MonteCarlo, *, base: int = 4096) -> list[dict[str, Any]]:
     for name, factor, goal in zip(names.start, starts, plant.coordinates.goal, strict=True):
         off = 2.0 * unit[:, factors.index(factor)] - 1.0 if factor in factors else np.zeros(count)
         drawn[name] = goal + settings.start * off
-    # The noise as one factor: which of a thousand million signals.
+    # The noise seed as one factor.
     drawn["noise_seed"] = (unit[:, factors.index("noise")] * 1e9).astype(np.int64)
     columns, _ = _simulate(settings, drawn)
     results = []

@@ -94,7 +94,7 @@ def _mean_response(episodes: Sequence[Episode]) -> dict[str, Any]:
     draws = [measure(errors[generator.integers(0, len(errors), len(errors))]) for _ in range(_RESAMPLES)]
     found: dict[str, Any] = {}
     for name in OF_THE_MEAN:
-        # Some means may never settle: infinity is a value here, between which and another there is nothing.
+        # A mean may be infinite: never settled.
         low, high = np.percentile([draw[name] for draw in draws], (2.5, 97.5), method="nearest")
         found[name] = {
             key: float(value) if math.isfinite(value) else None

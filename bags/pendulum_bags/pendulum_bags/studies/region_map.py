@@ -226,7 +226,7 @@ def _map(folder: Path, settings: RegionMap) -> RegionResult:
         if ends:
             angle, velocity = (columns[name].reshape(-1, *shape) for name in ends)
             turned += (attracted & (np.round((angle - UPRIGHT) / _TWO_PI) != 0.0)).sum(axis=0)
-            # Written so that a run which is not a number any more counts as moving.
+            # Negated, so that NaN counts as moving.
             moving += int((~attracted & ~(np.abs(velocity) < settings.tolerance[1])).sum())
     level = _level(settings)
     at = [axis.index for axis in settings.both]

@@ -92,7 +92,6 @@ def episode_of_run(place: Path, spec: RunSpec) -> Episode:
     if stamps.size < 10:
         raise DataError(f"run {place} has {stamps.size} states; expected at least 10")
     error = np.unwrap(wrap(position - UPRIGHT - spec.set_point))
-    # The turn that counts is the one on which it ends.
     error -= 2.0 * np.pi * np.round(error[-1] / (2.0 * np.pi))
     step = float(error[0]) if abs(error[0]) > _LEAST_STEP and _is_step(spec) else 0.0
     return Episode((stamps - stamps[0]) / NANOSECONDS, error, velocity, np.nan_to_num(command), step)

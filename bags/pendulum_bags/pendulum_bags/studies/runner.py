@@ -125,7 +125,6 @@ def run_study(
         progress.failed += record["status"] == "failed"
     pace = _Pace(waiting, workers)
     running: list[_Running] = []
-    # Runs in one process hold the interpreter, but only for tenths of a second; nodes are processes of their own.
     with (
         HostPool() as hosts,
         ProcessSet(folder / "logs", {}, hosts) as processes,
@@ -187,7 +186,7 @@ class _Running:
 def _start(folder: Path, run: StudyRun, processes: ProcessSet, threads: ThreadPoolExecutor) -> _Running:
     place = folder / "runs" / run.name
     before = read_record(folder, run)
-    # What is there without a record is half a run; with one, a failed run that is retried.
+    # Half a run, or a failed one to be retried.
     shutil.rmtree(place, ignore_errors=True)
     place.mkdir(parents=True)
     item = _Running(run, place, time.monotonic(), 1 + (before or {}).get("attempts", 0))
@@ -199,13 +198,13 @@ def _start(folder: Path, run: StudyRun, processes: ProcessSet, threads: ThreadPo
     command = [sys.executable, "-m", "pendulum_bags", "experiment"]
     if run.spec is None:
         command += [*run.arguments, "--out", str(place / "run")]
-        # The operator has confirmed before; this process has no terminal for a prompt.
+        # Confirmed before: this process has no terminal.
         command += ["--yes"] if run.lab else []
     else:
         command += ["run", str(place / "spec.json"), "--bag", str(place / "bag")]
-    # Each finds a free domain: one in this process's environment would be the same for all.
+    # Each run finds a free domain of its own.
     environment = {"ROS_DOMAIN_ID": ""}
-    # What is hosted once must go well a hundred times; a machine, or an experiment of several runs, starts afresh.
+    # A machine, or an experiment of several runs, gets new processes.
     alone = run.spec is None or not run.spec.simulated_time
     item.child = processes.start(run.name, command, ends_by_itself=True, environment=environment, alone=alone)
     return item

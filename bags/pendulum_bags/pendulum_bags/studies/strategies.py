@@ -155,7 +155,6 @@ def _figure(rows: Sequence[Mapping[str, Any]], motions: Mapping[str, tuple[Array
             if source is not None:
                 time, angle = motions[source["run"]]
                 shown = time <= _SHOWN
-                # Every panel has the same two curves: the first one's legend serves all.
                 legend = "" if panels else label
                 traces.append(Trace(time[shown], 1e3 * angle[shown], legend, role))
         low, high = row["damping_interval"] or (math.nan, math.nan)

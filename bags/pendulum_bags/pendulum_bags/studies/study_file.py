@@ -80,7 +80,6 @@ class StudyRun:
         labels = [self.labels[axis] for axis in ("plant", "controller", "disturbance", "start")]
         parts = [f"{label:.4g}" if isinstance(label, float) else str(label) for label in labels]
         name = "_".join([f"{self.number:05}", *(p for p in parts if p), f"seed{self.labels['seed']}"])
-        # A label may be any text; a folder's name may not.
         return name.replace("/", "-")
 
     @property
@@ -338,7 +337,6 @@ def _named_runs(
         if experiment == "thesis":
             if "strategy" in settings or not settings.get("lab"):
                 arguments += ["--strategy", str(settings.get("strategy", "direct_pwm"))]
-            # A study has its seeds: none of its runs is repeated automatically.
             arguments += ["--budget", "0"]
             arguments += _thesis_arguments(controllers[controller], controller, disturbances[disturbance])
             duration = _duration(file)
@@ -411,7 +409,7 @@ def _choice(file: LocatedMapping, key: str, choices: Sequence[str], default: str
 
 def _start_angle(start: Any, seed: int) -> float:
     if start == "random":
-        # A stream of its own: the same number must not be the start and the first sample of the noise.
+        # A stream of its own: start and first noise sample must differ.
         return float(noise.uniform(seed, 2**40, math.pi))
     return STARTS[start] if isinstance(start, str) else float(start)
 

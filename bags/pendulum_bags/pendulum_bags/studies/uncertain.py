@@ -80,7 +80,6 @@ class Uncertainty:
         if ratio > 0.0:
             found["static_friction"] = ratio * drawn["coulomb_friction"]
         else:
-            # Nothing varies; the plant's own static friction stays.
             del found["coulomb_friction"]
         return found
 

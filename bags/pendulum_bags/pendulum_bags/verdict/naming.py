@@ -29,7 +29,6 @@ def name_in(value: _T, *, emulated: bool) -> _T:
 
 
 def _named(value: Any) -> Any:
-    # A file may be called hardware.xml.
     if isinstance(value, (Enum, Case)):
         return value
     if isinstance(value, str):

@@ -230,7 +230,6 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest], refused
                 f"designs are safe all the same ({how_to_measure(comparison)[Layer.WHICH_CONTROLLERS]})."
             )
     elif late is not None and foreign:
-        # A plant file has no effect on it.
         steps.append(f"Give {foreign} {_late(late)}; measure again.")
     elif late is not None:
         steps.append(

@@ -254,7 +254,7 @@ class _Run:
             runs.append(MachineRun(folder / "hw", lockstep_spec(settings, side="hw")))
         if not order.alone:
             sim, hw = (lockstep_spec(settings, side=side) for side in ("sim", "hw"))
-            # Two simulations without noise of their own may be one: in lockstep their recordings would be one, too.
+            # Two simulations without noise would give the same recordings in lockstep.
             if hw.has_bridge and not isinstance(settings, JointSettings):
                 first = lockstep_spec(repeat_settings(settings, 1), side="hw")
                 runs.append(MachineRun(repeat_folder(folder, 1) / "hw", first))
@@ -375,7 +375,7 @@ class _Run:
             return
         found = self.found
         if IDENTIFIED in self.order.steps and found.given.answer().mark is not Mark.YES:
-            # It runs in a program of its own, which can be ended at any time, beside what this one computes.
+            # In a program of its own, which can be ended at any time.
             yield self._begin_identification
         yield from self._simulate(found.given)
         if self.identification is not None:
@@ -419,7 +419,7 @@ class _Run:
         assert self.identification is not None
         deadline, file, place = self.found.deadline, self.folder / PLANT_FILE, self.folder / IDENTIFIED
         self._phase("identifying the plant", 12.0)
-        # While it waits: what writes the page takes a second or two to load.
+        # Loaded while waiting: it takes seconds.
         import_module("pendulum_bags.report.write")
         import_module("matplotlib.backends.backend_pdf")
         while (code := self.identification.process.poll()) is None:
@@ -521,7 +521,6 @@ def _of(plant: Simulated, spec: RunSpec) -> RunSpec:
 
 def _refusal(identification: Child) -> str:
     try:
-        # What refuses comes first.
         return str(json.loads(identification.log.read_text(encoding="utf-8"))["sentences"][0])
     except (ValueError, LookupError, TypeError):
         return identification.last_words(1).removeprefix("error: ")

@@ -50,7 +50,7 @@ def write_whole_report(
         errors = [_ERRORS] if given.layers else []
         return replace(page, figures=figures, tables=tables, others=others, notes=[*page.notes, *errors, *found.notes])
 
-    # Files for paper take three times as long as the page: what ends early has its plots alone.
+    # Files for print take three times as long as the page: omitted after an early end.
     formats = () if found.interrupted or found.spent else ("png", "pdf")
     if "" not in given.comparisons:
         return write_joint_report(

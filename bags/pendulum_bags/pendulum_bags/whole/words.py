@@ -25,7 +25,6 @@ def whole_answer(found: Findings) -> tuple[Answer, list[Answer]]:
         f"which this run found.{choice} With {first}: {given.reasons}."
     )
     if identified.mark is Mark.YES:
-        # What held of the given plant is no longer needed; which test decides is.
         text += replace(given, holds="", missing=identified.missing).remarks()
     else:
         text += f" With {name}: {identified.reasons}."

@@ -331,7 +331,7 @@ class Hub:
             for name, types in self._node.get_service_names_and_types()
             if name.endswith(_STOP_SERVICE)
             and "std_srvs/srv/Trigger" in types
-            # A name stays listed as long as any node, this one included, has a client of it.
+            # A name stays listed while any node, this one included, has a client.
             and self._node.count_services(name)
         }
         with self._lock:

@@ -78,7 +78,7 @@ class Jobs:
 
     def experiment(self, seed: int) -> Job:
         """Run the thesis's experiment in a ROS domain of its own; its folder gets a report."""
-        # Not in this domain: its plants have the names of those that are shown here.
+        # Another domain: plants have the same names.
         environment = {name: value for name, value in os.environ.items() if name != "ROS_DOMAIN_ID"}
         return self._start("experiment", ["experiment", "thesis", "--seed", str(seed)], "--out", environment)
 

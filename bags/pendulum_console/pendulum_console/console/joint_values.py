@@ -51,7 +51,7 @@ class JointValues:
         joints = []
         for joint in self._joints:
             efforts = {kind: effort for (name, kind), (effort, _) in self._efforts.items() if name == joint.name}
-            # JSON has no infinities or NaN: the page could read nothing more, of any plant.
+            # JSON has no infinities or NaN.
             values = {key: value for key, value in {**self._states[joint.name], **efforts}.items() if isfinite(value)}
             joints.append({"name": joint.name, "unit": joint.unit, "goal": joint.goal, **values})
         return {"joints": joints, **self._drawn()}
@@ -66,7 +66,6 @@ class JointValues:
         still = mechanism.chain((0.0,) * len(position), p)
         scale = 1.0 / sum(map(dist, still, still[1:]))
         drawn = [[scale * value for value in mechanism.seen(point)] for point in mechanism.chain(position, p)]
-        # The arm of a spatial mechanism turns in a circle.
         circle = [scale * value for value in mechanism.seen((dist(*still[:2]),) * 2 + (0.0,))]
         return {
             "points": drawn,

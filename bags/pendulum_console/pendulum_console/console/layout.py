@@ -59,7 +59,7 @@ class Layout:
             ui.html('<h1 class="title">Pendulum console</h1>', sanitize=False)
             ui.html('<span id="link" role="status">connecting</span>', sanitize=False)
             self._notices.build()
-            # Plain HTML and a request of its own: it works while the rest of the page waits for the server.
+            # Plain HTML with its own request: works while the page waits for the server.
             ui.html(
                 '<button id="e_stop" type="button" aria-keyshortcuts="Space Escape Enter"'
                 ' title="Space, Escape or Enter">E-STOP<small>Space, Esc or Enter</small></button>',
@@ -71,7 +71,7 @@ class Layout:
                 ui.html('<canvas id="pendulum" role="img" aria-label="pendulums, drawn live"></canvas>', sanitize=False)
                 ui.html('<div id="plants"></div>', sanitize=False)
                 ui.html('<div id="joints"></div>', sanitize=False)
-                # Next to the plots, where it moves no button when a plant appears.
+                # Where it moves no button when a plant appears.
                 with ui.element("div").classes("hint") as self._hint:
                     ui.label("Start one in a terminal with the same ROS_DOMAIN_ID; it appears here by itself:")
                     ui.html(f"<pre>{as_typed(_PLANTS)}</pre>", sanitize=False)
@@ -124,7 +124,7 @@ class Layout:
         with ui.row():
             _button("Arm", lambda: self._carefully(self._graph.arm(node, on=True)), filled=True, of=space)
             _button("Disarm", lambda: self._carefully(self._graph.arm(node, on=False)), of=space)
-            # The page's script sends it, like the e-stop of all: repeated until there is a response.
+            # Sent by the page's script, repeated until there is a response.
             _button("Stop", lambda: None, of=space, danger=True).props(f'data-stop="{node}"')
             _button("Reset e-stop", lambda: self._carefully(self._graph.reset(node)), of=space)
         with ui.row():

@@ -160,7 +160,7 @@ class LiveNode(PollingNode):
             name: types[0]
             for name, types in self.get_service_names_and_types()
             if not (name.startswith(own) or types[0].startswith(_OF_PARAMETERS) or "/_" in name)
-            # A name stays listed as long as any node, this one included, has a client of it.
+            # A name stays listed while any node, this one included, has a client.
             and self.count_services(name)
         }
         for name in self._callable.keys() - there.keys():

@@ -84,7 +84,7 @@ class Recorder(PollingNode):
         self.create_service(Trigger, "~/annotate", self._on_annotate)
         self.create_service(Trigger, "~/status", self._on_status)
         self._discover()
-        # Steady time: discovery must not stop when the system clock is set back or simulated time stands still.
+        # Steady time: discovery must not depend on system or simulated time.
         create_wall_timer(self, DISCOVERY_PERIOD, self._discover)
         self._leave = threading.Event()
         self._poller = threading.Thread(target=self._poll, name="bag intake", daemon=True)

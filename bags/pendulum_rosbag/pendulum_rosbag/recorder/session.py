@@ -148,7 +148,7 @@ class RecordingSession:
                     raise
             except OSError as error:
                 self.fail(error)
-        # Also after a disk failure: messages of the topic are lost and have to be counted.
+        # Also after a disk failure: lost messages are counted.
         self._counts.setdefault(name, TopicCount())
 
     def offer(self, topic: str, items: Sequence[tuple[int, bytes]]) -> int:
@@ -235,7 +235,6 @@ class RecordingSession:
         if items:
             self.writer.write_many(items)
         self.writer.seal()
-        # Also in a killed recorder's bag.
         gaps = {
             name: {"lost": count.missing + count.refused, "early": count.early, "before": count.before}
             for name, count in self._counts.copy().items()

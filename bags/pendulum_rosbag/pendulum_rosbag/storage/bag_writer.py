@@ -95,7 +95,6 @@ class BagWriter:
         self._files: list[FileEntry] = []
         self._lock = threading.RLock()
         self._open = True
-        # The folder gets its name only when it is complete.
         self._folder = path.with_name(f".{path.name}.{os.getpid()}.tmp")
         self._metadata = MetadataFile(self._folder, storage, ros_distro)
         try:
@@ -219,7 +218,6 @@ class BagWriter:
         """Seal, and wait until the disk has it (survives a power failure); other threads may write meanwhile."""
         with self._lock:
             self._require_open()
-            # Settled chunks are never rewritten, so what has reached the disk stays safe.
             self._seal(self._file.settle)
             descriptor = self._file.duplicate()
         try:
@@ -251,7 +249,6 @@ class BagWriter:
             try:
                 self._close_file()
             finally:
-                # Closing the file may have freed the space that this needs.
                 self._metadata.finish(*self._described)
 
     def abandon(self) -> None:

@@ -273,7 +273,7 @@ class McapLayout:
 
     def _grow(self, needed: int) -> None:
         capacity = max(_FIRST_SLOT, -(-2 * (self.summary.size + 4 * _PAGE) // _PAGE) * _PAGE)
-        # Summaries are rewritten each time, so the room stays in proportion to them.
+        # Summaries are rewritten each time, so this space is proportional to them.
         room = max(min(max(_FIRST_ROOM, self.settled_end), _LARGEST_ROOM), 4 * self.summary.size)
         staging = min(max(room // 2, self._area.stop - self._area.start), 8 * _LARGEST_GROUP) // _PAGE * _PAGE
         old_size = self._size

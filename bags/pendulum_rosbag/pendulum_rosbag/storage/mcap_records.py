@@ -86,7 +86,6 @@ def header_record(library: str) -> bytes:
 
 def schema_record(schema_id: int, name: str, encoding: str, definition: str) -> bytes:
     """Return a message definition under an id of 1 or more."""
-    # Definitions that are not UTF-8 were read with surrogate escapes.
     data = definition.encode(errors="surrogateescape")
     head = struct.pack("<H", schema_id) + _text(name) + _text(encoding) + struct.pack("<I", len(data))
     return record(SCHEMA, head + data)

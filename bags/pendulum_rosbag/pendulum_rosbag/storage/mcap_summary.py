@@ -87,7 +87,6 @@ class McapSummary:
         self._schemas: list[bytes] = []
         self.description = b""
         """Records of definitions and topics, with which each summary begins."""
-        # Running checksums: description and settled chunks; these and the staged chunks.
         self._settled_crc = 0
         self._staged_crc = 0
 

@@ -97,7 +97,6 @@ class SealedMcapFile:
         channel = rec.channel_record(channel_id, schema_id, topic, type.serialization, described)
         self._summary.add_channel(channel_id, channel)
         self._sequences[channel_id] = 0
-        # Also in the chunk, for sequential readers.
         self._pending += [schema, channel]
         self._pending_size += len(schema) + len(channel)
         self._stale = True
@@ -164,7 +163,7 @@ class SealedMcapFile:
             try:
                 self.settle()
             finally:
-                # Also after a failed seal: on a full disk the unused room is worth giving back.
+                # Also after a failed seal: a full disk needs the unused space.
                 own = [Metadata("rosbag2", {"serialized_metadata": metadata})] if metadata else []
                 self._layout.finish([*self._records, *own])
             self._layout.sync()
@@ -191,7 +190,7 @@ class SealedMcapFile:
             self._take_pending()
             self._finish_group(record)
             return
-        # The message is too large for the room before the staged chunks: settle those first, without it.
+        # Too large for the space before the staged chunks: settle those first.
         self._settle_group()
         self._publish()
         chunk = self._group_chunk(with_pending=True)

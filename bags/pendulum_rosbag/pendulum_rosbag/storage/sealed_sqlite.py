@@ -228,7 +228,6 @@ class SealedSqliteFile:
             shutil.copyfile(self.path, copy)
             connection = sqlite3.connect(copy)
             try:
-                # An unfinished copy is discarded: no journal, no sync.
                 connection.execute("PRAGMA journal_mode = OFF")
                 connection.execute("PRAGMA synchronous = OFF")
                 connection.execute(_INDEX)
@@ -239,5 +238,4 @@ class SealedSqliteFile:
                 os.fsync(file.fileno())
             os.replace(copy, self.path)
         except (OSError, sqlite3.OperationalError):
-            # The bag is complete without the index; only seeking in a long one is slower.
             copy.unlink(missing_ok=True)
