@@ -1,4 +1,4 @@
-"""Types of the arrays that all rooms hand each other."""
+"""Types of arrays shared by all subpackages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``experiment benchmark``: the public double-pendulum benchmark, our controllers beside its published rows."""
+"""``experiment benchmark``: the public double-pendulum benchmark, with its published rows."""
 
 from __future__ import annotations
 

@@ -152,7 +152,7 @@ class TrialSettings:
 
 
 _LISTENERS = 2
-"""Subscribers of the bridge's states besides the orchestrator: procedure and recorder."""
+"""Subscribers of the bridge's states in addition to the orchestrator: procedure and recorder."""
 
 
 def run_trials(

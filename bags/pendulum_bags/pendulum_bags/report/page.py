@@ -46,7 +46,7 @@ FOLDED = (
     "Repeated runs", "The thesis's analysis", "Dynamic phase", "Timing", "Experiment 1: inertia and damping",
     "Experiment 2: gravity", "Model", "A real pendulum",
 )  # fmt: skip
-"""Sections that are closed when the page opens: the answer does not depend on them."""
+"""Sections that are closed when the page opens."""
 _LEADS = ("both_together", "joints_together")
 """Figures whose first panel is also next to the answer."""
 _MOST_SEEDS = 3

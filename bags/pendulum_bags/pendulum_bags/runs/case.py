@@ -1,4 +1,4 @@
-"""Which plants a result is of: results make one answer only where simulation and hardware are the same in all."""
+"""The plants of a result: results are combined only for the same simulation and hardware."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def identity_of(name: str, *content: Any) -> str:
 
 
 def plant_identity(plant: PlantParameters) -> str:
-    """Return the identity of a plant of ours: two that move alike have one, whatever their files are called."""
+    """Return the identity of a plant: equal for plants that move alike, independent of the file's name."""
     values = json.loads(describe_plants([plant]))[0]
     return identity_of(str(values.pop("name")), values)
 

@@ -294,7 +294,7 @@ class _Named(Protocol):
 
 
 def distinct_names(recordings: Sequence[_Named]) -> list[str]:
-    """Return a name for each recording: that of its file, with as many of its folders as tell it from the others."""
+    """Return a name for each recording: its file, with as many folders as make it unique."""
     parts = [Path(r.source or r.name).parts or (r.name,) for r in recordings]
     names = []
     for i, own in enumerate(parts):

@@ -18,7 +18,7 @@ _FIELDS = {"reference": str, "set_point": float, "amplitude": float, "frequency"
 
 
 def follows_reference(metadata: Mapping[str, Any], space: str) -> bool:
-    """Tell whether the controller of a recorded run followed a reference that moved."""
+    """Return whether the controller of a recorded run followed a moving reference."""
     recorded = _parameters(metadata, space)
     kinds = {recorded.get("controller"), record_named(run_record(metadata), "controller").get("kind")}
     return _KIND in kinds and recorded.get("amplitude") != 0.0

@@ -52,11 +52,11 @@ START_EVENT = Event.NOISE_START
 END_EVENT = Event.NOISE_END
 
 OpenBag: TypeAlias = Callable[[str | os.PathLike[str]], AbstractContextManager[Bag]]
-"""How a bag is opened: ``read_bag``, or one that keeps it open for the next joint."""
+"""How a bag is opened: ``read_bag``, or ``CachedBags`` for several joints."""
 
 
 _SLIDING = frozenset(joint.name for mechanism in MECHANISMS.values() for joint in mechanism.joints if joint.unit == "m")
-"""Joints whose position is a place and no angle; a message names them, and no unit."""
+"""Sliding joints, for messages without a unit."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class RunData:
 
     @property
     def is_disturbed(self) -> bool:
-        """Whether so many states are missing that the run tells more of the machine than of the plant."""
+        """Whether so many states are missing that the run shows the computer rather than the plant."""
         return missed_share(self.missed_deadlines, self.window.t.size) > TOLERATED
 
     @property
@@ -385,7 +385,7 @@ def plant_summary(run: RunData) -> dict[str, Any]:
 
 
 def is_emulated(run: RunData) -> bool:
-    """Return whether the run says that an emulator, or a second simulation, stood in for the hardware."""
+    """Return whether the hardware was an emulator or a second simulation."""
     return is_surrogate(run_record(run.metadata))
 
 
@@ -402,7 +402,7 @@ def surrogate_of(run: RunData) -> str:
 
 
 def noise_hold_time(run: RunData) -> float | None:
-    """Return how long each noise sample was held [s]: what the run says, else what its disturbance shows."""
+    """Return how long each noise sample was held [s], by the run record, else by its disturbance."""
     recorded = run_record(run.metadata).get("disturbance")
     if isinstance(recorded, Mapping):
         value = recorded.get("hold_time")

@@ -89,18 +89,18 @@ def pair_folders(folder: Path) -> list[Path]:
 
 
 def is_repeat(folder: Path) -> bool:
-    """Tell whether a folder with the bags ``sim`` and ``hw`` is a repeat of the run folder that holds it."""
+    """Return whether a folder with the bags ``sim`` and ``hw`` is a repeat of the run folder around it."""
     run = folder.parent.parent
     return folder.parent.name == REPEATS and folder.name.isdigit() and (run / "sim").is_dir() and (run / "hw").is_dir()
 
 
 def write_looks(folder: Path, number: int) -> None:
-    """Keep how often the data of a run folder have been looked at while more were recorded."""
+    """Store the number of interim analyses of a run folder."""
     write_json(folder / _LOOKS, {"looks": number})
 
 
 def read_looks(folder: Path) -> int:
-    """Return how often the data of a run folder have been looked at; 0 for a run that was recorded once."""
+    """Return the number of interim analyses of a run folder; 0 for a run that was recorded once."""
     try:
         return int(json.loads((folder / _LOOKS).read_text(encoding="utf-8"))["looks"])
     except (OSError, ValueError, KeyError, TypeError):
@@ -113,7 +113,7 @@ def write_stall(folder: Path, reason: str, logs: str) -> None:
 
 
 def read_stalls(folder: Path) -> list[dict[str, str]]:
-    """Return reason and logs of each run that broke off before the one that a run folder holds, in order."""
+    """Return reason and logs of each aborted run before the one in a run folder, in order."""
     try:
         stalls = json.loads((folder / _STALLS).read_text(encoding="utf-8"))["stalls"]
         return [{key: str(stall[key]) for key in ("reason", "logs")} for stall in stalls]

@@ -1,4 +1,4 @@
-"""What a bag says of the run that it holds: who controlled what plant, under which disturbance and seed."""
+"""The run record in a bag: controller, plant, disturbance, seed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ RUN_RECORD = "pendulum.run"
 DIFFERENCE = "difference"
 """Entry of a record's simulation: how it moves otherwise than the equation of the design."""
 SURROGATE = "stand_in"
-"""Entry of the record that says what stood in for the hardware: ``simulation``, where a second one did."""
+"""Entry of the record for a surrogate of the hardware: ``simulation`` for a second one."""
 
 
 def run_record(metadata: Mapping[str, Any]) -> Mapping[str, Any]:

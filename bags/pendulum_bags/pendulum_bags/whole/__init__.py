@@ -1,1 +1,1 @@
-"""The whole answer in one run: a given plant and the one identified from it, beside one machine, in all four layers."""
+"""All four layers in one run: a given plant and the one identified from it, against one machine."""

@@ -359,7 +359,7 @@ class _Run:
         record_repeat(folder, settings, number, deadline)
 
     def carry_out(self, step: Callable[[], None]) -> None:
-        """Carry out a step; one that fails once there is an answer leaves a note, and the others go on."""
+        """Carry out a step; after the first answer, a failed one leaves a note."""
         try:
             step()
         except BudgetSpentError:

@@ -1,4 +1,4 @@
-"""Controllers that a ranking compares: each differs from all others, and runs on every plant of the answer."""
+"""Controllers of a ranking: all different, and able to run on every plant of the answer."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from pendulum_msgs_py.errors import FaultError
 __all__ = ["VIEWERS", "Request", "as_asked", "parse", "refusal", "to_server"]
 
 VIEWERS = frozenset({"https://app.foxglove.dev", "file://"})
-"""Admitted origins besides this machine's: Foxglove in a browser, and desktop programs (Electron)."""
+"""Admitted origins in addition to this machine's: Foxglove in a browser, and desktop programs (Electron)."""
 NEWER = "foxglove.sdk.v1"
 OLDER = "foxglove.websocket.v1"
 """Older name of the same protocol, which Lichtblick requests."""

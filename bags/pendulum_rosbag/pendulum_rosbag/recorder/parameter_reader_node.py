@@ -1,4 +1,4 @@
-"""Parameters of all nodes, so that a bag has the values behind its data."""
+"""Parameters of all nodes, for the bag."""
 
 from __future__ import annotations
 

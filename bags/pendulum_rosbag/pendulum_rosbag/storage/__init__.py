@@ -1,4 +1,4 @@
-"""Writing bags: rosbag2 folders (MCAP, SQLite) that stay readable whatever happens to the writer."""
+"""Writing bags: rosbag2 folders (MCAP, SQLite) that stay readable after a crash of the writer."""
 
 from pendulum_rosbag.storage.bag_writer import STORAGES, BagWriter
 from pendulum_rosbag.storage.message_types import MessageType, message_type, typestore
