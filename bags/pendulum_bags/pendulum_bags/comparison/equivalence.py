@@ -166,11 +166,9 @@ def _power(estimate: float, bottom: float, top: float, error: float, reach: floa
 
 @dataclass(frozen=True)
 class Verdict:
-    """All tests together.
+    """All tests together: equivalent if all are, not equivalent if one is not, undecided otherwise.
 
-    Args:
-        outcome: Equivalent if all are, not equivalent if one is not, undecided otherwise.
-        more_runs: Further runs for a decision; 0 where decided, None where more hardly help.
+    ``more_runs`` are further runs for a decision; 0 where decided, None where more hardly help.
     """
 
     outcome: Outcome

@@ -32,11 +32,9 @@ _OF_THE_NOISE = ("kind", "amplitude", "hold_time")
 
 
 def check_pairs(pairs: Sequence[tuple[RunData, RunData]]) -> None:
-    """Refuse pairs of simulation and hardware that must not be compared or pooled.
+    """Refuse swapped sides, different controllers, and a recording or a seed that is given twice.
 
-    Raises:
-        DataError: The sides are swapped or had different controllers; a recording or a seed is repeated; or runs differ
-            in controller, disturbance or plant.
+    Runs to pool must also agree in controller, disturbance and plant. Raises a DataError.
     """
     for simulation, hardware in pairs:
         _check_sides(simulation, hardware)

@@ -97,14 +97,10 @@ class Margins:
 
     @classmethod
     def parse(cls, margin: MarginArgument = None) -> Margins:
-        """Return margins from what a user states.
+        """Return margins from None for the defaults, a margins file, a mapping of names to values, texts, or margins.
 
-        Args:
-            margin: None for the defaults, the path of a margins file, a mapping of names to values, texts such as
-                ``delay=8 ms`` or ``spread_angle=0.2 deg``, or margins.
-
-        Raises:
-            ParameterError: An unknown name, a unit of another quantity, or a value out of domain.
+        Texts are such as ``delay=8 ms`` or ``spread_angle=0.2 deg``. A ParameterError for an unknown name, a unit of
+        another quantity, or a value out of domain.
         """
         if isinstance(margin, Margins):
             return margin

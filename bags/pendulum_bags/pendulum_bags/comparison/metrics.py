@@ -79,10 +79,7 @@ def _settling_time(episode: Episode) -> float:
 
 
 def _smoothness(episode: Episode) -> float:
-    """Root mean square change of the torque within ``CHANGE_TIME``, per that time; NaN if samples are further apart.
-
-    A fixed time makes it independent of the sampling rate.
-    """
+    """Root mean square change of the torque within ``CHANGE_TIME``, per that time; NaN for slower samples."""
     t = episode.t
     if float(np.median(np.diff(t))) > CHANGE_TIME * (1.0 + 1e-6):
         return float("nan")

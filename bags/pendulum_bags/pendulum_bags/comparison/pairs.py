@@ -41,10 +41,7 @@ class Difference:
 
 
 def interpolated_difference(simulation: Series, hardware: Series, *, at: str = "simulation") -> Difference:
-    """Return the difference, with one motion interpolated by cubic splines at the other's stamps.
-
-    ``at`` is ``simulation`` for its stamps, as in the thesis, or ``slower`` for those of the motion with fewer samples.
-    """
+    """Return the difference at the stamps of the simulation, or of the ``slower`` motion, by cubic splines."""
     start, stop = shared_span(simulation, hardware)
     use_simulation = at == "simulation" or simulation.period > 1.01 * hardware.period
     times = (simulation if use_simulation else hardware).t
@@ -55,11 +52,9 @@ def interpolated_difference(simulation: Series, hardware: Series, *, at: str = "
 
 @dataclass(frozen=True)
 class Pair:
-    """One run of simulation and hardware, compared.
+    """One run of simulation and hardware, compared; ``signal`` is None if the disturbances were not recorded.
 
     Args:
-        signal: The disturbances of both; None where they were not recorded.
-        response: Alignment of the motions.
         aligned: Difference after the response delay has been taken out of the hardware.
         on_one_clock: Whether a shared signal other than a disturbance brought both to one clock.
     """

@@ -129,11 +129,7 @@ def compare_recordings(
     shared: Sequence[Shared] | None = None,
     margins: Margins | None = None,
 ) -> Comparison:
-    """Compare a simulation with at least one run of a machine; ``shared`` is found by default.
-
-    Raises:
-        DataError: There is nothing to compare, a plant did not move, or the recordings have no time in common.
-    """
+    """Compare a simulation with at least one run of a machine; ``shared`` is found by default."""
     margins = margins or Margins.parse()
     if not hardware:
         raise DataError(f"{simulation.source} has nothing to be compared with; expected a recording of the machine")
@@ -273,10 +269,7 @@ def _unlike(what: str, kind: str, ours: Signal, theirs: Signal, correlation: flo
 
 
 def _best_shift(signals: Sequence[tuple[Signal, Signal]], ours: RunData, theirs: RunData) -> tuple[float, float]:
-    """Return the shift [s] of the second of each pair with the largest correlation, and that correlation.
-
-    It is the mean over the pairs, over the overlapping samples: at least half of the shorter recording.
-    """
+    """Return the shift [s] of the second ones with the largest mean correlation, and that correlation."""
     period = max(
         min(ours.window.period, theirs.window.period),
         ours.window.duration / _MOST_SAMPLES,

@@ -318,10 +318,7 @@ def _beside(runs: Sequence[_Run], statistic: Statistic, size: float) -> float:
 
 
 def _find_delay(seen: Sequence[_Seen]) -> float | None:
-    """Return the delay at which the velocities of all runs are most alike, to a whole ``LAG_STEP`` [s].
-
-    None at an end of the searched range, or where they are hardly alike: beyond the range, noise has small peaks.
-    """
+    """Return the delay of the most alike velocities, to a whole ``LAG_STEP`` [s]; None without a peak."""
     reach = LONGEST_DELAY - float(_LAGS[-1])
     coarse = int(np.clip(0.1 / (seen[0].clock.band * LAG_STEP), 1.0, 10.0))
     end = round(reach / LAG_STEP)

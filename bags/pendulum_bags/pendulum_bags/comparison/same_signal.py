@@ -24,11 +24,7 @@ AMPLITUDE = 1.1
 
 @dataclass(frozen=True)
 class SharedSignal:
-    """Two recorded disturbances compared.
-
-    Args:
-        threshold: Correlation that independent signals exceed at any lag with a probability of ``CHANCE``.
-    """
+    """Two recorded disturbances; independent ones exceed ``threshold`` at any lag with a probability of ``CHANCE``."""
 
     alignment: Alignment
     amplitude: float

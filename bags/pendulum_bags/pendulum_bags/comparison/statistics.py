@@ -74,8 +74,7 @@ class Interval(NamedTuple):
 class Jackknife:
     """An estimate with its standard error, from estimates that each lack one part of the data.
 
-    Attributes:
-        between: The same estimate with the error between runs; None where they differ by chance alone.
+    ``between`` is the same estimate with the error between runs; None where they differ by chance alone.
     """
 
     estimate: float
@@ -100,12 +99,7 @@ class Jackknife:
         return cls(estimate, math.sqrt(variance), blocks - 1.0, blocks)
 
     def of_runs(self, runs: Array, sizes: ArrayLike) -> Jackknife:
-        """Return the mean over runs, with an interval at least as wide as Student's t of the runs.
-
-        Args:
-            runs: Estimates from each run alone, shape (n,).
-            sizes: Samples of each, shape (n,).
-        """
+        """Return the mean over runs from their estimates and samples (n,), no narrower than Student's t of the runs."""
         if len(runs) < 2:
             return self
         weights = np.asarray(sizes, dtype=float) / np.sum(sizes)

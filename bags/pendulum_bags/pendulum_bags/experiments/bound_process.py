@@ -24,8 +24,7 @@ def start_bound_process(
 ) -> subprocess.Popen[bytes]:
     """Start a program in a process group of its own, to which this process passes Ctrl-C in order.
 
-    ``environment`` is complete; ``niceness`` is priority to give away, or to take if negative and permitted; the
-    program inherits ``pass_fds``.
+    ``environment`` is complete; ``niceness`` may be negative if permitted; ``pass_fds`` are inherited.
     """
     return subprocess.Popen(
         list(command),

@@ -25,11 +25,9 @@ def slowness() -> float:
 
 
 class Deadline:
-    """A wall time limit, ``seconds`` from now or infinite [s].
+    """A wall time limit, ``seconds`` from now or infinite, by a monotonic ``clock`` [s].
 
-    Args:
-        reserve: Processor time that must be left at the end [s]; at most half of all.
-        clock: Monotonic clock [s].
+    ``reserve`` is processor time that must be left at the end [s], at most half of all.
     """
 
     def __init__(

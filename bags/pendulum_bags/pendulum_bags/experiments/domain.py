@@ -20,7 +20,7 @@ MAX_DOMAIN = 100
 
 @contextlib.contextmanager
 def reserve_domain(requested: int | None = None) -> Iterator[int]:
-    """Reserve a ROS domain for the context: ``requested``, or else ``ROS_DOMAIN_ID`` or the first free one.
+    """Reserve the ROS domain ``requested``, or ``ROS_DOMAIN_ID``, or the first free one, for the context.
 
     A ParameterError for an invalid domain, a FaultError if another experiment uses it or all are in use.
     """
@@ -65,10 +65,7 @@ def check_domain(requested: int | None) -> int | None:
 
 
 def is_unused(domain: int) -> bool:
-    """Return whether no DDS participant on this machine listens in the domain.
-
-    Source: DDSI-RTPS 2.5, section 9.6.2.3: unicast discovery ports start at 7400 + 250 domain + 10.
-    """
+    """Return whether no DDS participant on this machine has the domain's ports (DDSI-RTPS 2.5, section 9.6.2.3)."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind(("", 7400 + 250 * domain + 10))

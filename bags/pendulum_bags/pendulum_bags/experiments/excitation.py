@@ -1,7 +1,6 @@
 """Play a designed excitation on a plant: torque through the disturbance node, while a controller commands zero.
 
-A plant applies torque only if a controller replies. Here a zero-torque playback replies during the run: when the run
-ends, the replies stop and the plant goes to zero torque by its own rules.
+The end of the replies brings the plant to zero torque by its own rules.
 """
 
 from __future__ import annotations

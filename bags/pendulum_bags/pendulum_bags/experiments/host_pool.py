@@ -118,10 +118,7 @@ class HostPool:
     def start(
         self, command: Sequence[str], *, environment: Mapping[str, str], log: Path, niceness: int = 0
     ) -> HostedProgram | None:
-        """Start ``[sys.executable, "-m", PACKAGE, EXECUTABLE, ...]`` in an idle or new host; None for other commands.
-
-        ``environment`` is complete; output is appended to ``log``; ``niceness`` may be negative if permitted.
-        """
+        """Start ``[sys.executable, "-m", PACKAGE, EXECUTABLE, ...]`` in an idle or new host, or return None."""
         interpreter, flag, package, executable = [*command[:4], *[""] * (4 - len(command))]
         if interpreter != sys.executable or flag != "-m" or not package.startswith("pendulum_") or not executable:
             return None

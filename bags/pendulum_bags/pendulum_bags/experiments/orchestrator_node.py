@@ -91,10 +91,7 @@ class Orchestrator:
             self._slice(min(_SLICE, left))
 
     def wait_for(self, what: str, predicate: Callable[[], _T], timeout: float, *, until: Future | None = None) -> _T:
-        """Wait, at most ``timeout`` [s], until a predicate, evaluated between slices, holds; return its value.
-
-        ``what`` is named in the error; ``until`` ends a slice early.
-        """
+        """Wait, at most ``timeout`` [s], until a predicate holds; return its value. ``until`` ends a slice early."""
         deadline = time.monotonic() + timeout
         while not (value := predicate()):
             if time.monotonic() > deadline:
@@ -281,10 +278,7 @@ class PlantClient:
         )
 
     def trajectory_finished(self) -> bool:
-        """Return whether the last requested move has ended.
-
-        A PlantStoppedError if the plant faulted, was stopped or disarmed; a FaultError if it refused or is silent.
-        """
+        """Return whether the last requested move has ended; PlantStoppedError, or FaultError if refused or silent."""
         self.check_alive()
         for event in self.events[self._finished_before :]:
             if event["name"] == Event.TRAJECTORY_REFUSED:

@@ -204,10 +204,7 @@ def start_recorder(
     simulated: bool = False,
     priority: int = 0,
 ) -> Child:
-    """Start the recorder of one plant's topics as the node ``recorder`` in its namespace.
-
-    ``metadata`` is a JSON file about the run; ``simulated`` time is the plant's; ``priority`` is real-time, 0 for none.
-    """
+    """Start the recorder of one plant's topics in its namespace, with ``metadata``, a JSON file about the run."""
     command = [sys.executable, "-m", "pendulum_bags", "record", "-o", str(bag)]
     command += ["--regex", f"^({namespace}/.*|/diagnostics|/clock)$", "--storage", storage]
     command += ["--metadata", str(metadata), "--log-time", "header" if simulated else "receive"]

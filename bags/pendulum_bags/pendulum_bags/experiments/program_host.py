@@ -101,10 +101,7 @@ def _write_to(log: Path) -> None:
 
 
 def _left_behind() -> bool:
-    """Return whether a program left a thread that blocks the process's end, or one of the middleware.
-
-    The middleware names its threads; Python's have the name of the process.
-    """
+    """Return whether a program left a thread of its own or of the middleware, which names them."""
     if any(not thread.daemon for thread in threading.enumerate() if thread is not threading.main_thread()):
         return True
     names = set()

@@ -98,10 +98,7 @@ class Session:
     def wait_until_all_hear_each_other(
         self, namespace: str, listeners: Mapping[str, int], *, clock: bool = True
     ) -> None:
-        """Wait until every subscription of a run is on the graph, and the recorder's are matched.
-
-        ``listeners``: required subscriptions by relative topic name; ``clock``: the plant publishes simulated time.
-        """
+        """Wait until every subscription of a run (``listeners`` by relative topic) is on the graph and recorded."""
         orchestrator, node = self.orchestrator, self.orchestrator.node
 
         def complete() -> bool:

@@ -49,12 +49,9 @@ def _facts(name: str, mapping: str, plant: str) -> _Facts:
 
 @dataclass(frozen=True)
 class ForeignSimulation:
-    """A simulation in place of the simulator.
+    """A model file or ``gymnasium:ID`` in place of the simulator, with a mapping file or "".
 
-    Attributes:
-        name: Model file, or ``gymnasium:ID``.
-        mapping: Its mapping file; empty for none.
-        plant: Preset or plant file of a simulation of several joints; empty for a pendulum, whose equation is found.
+    ``plant`` is the preset or plant file of several joints; empty for a pendulum, whose equation is found.
     """
 
     name: str

@@ -1,7 +1,6 @@
 """A run that a stalled computer aborted is no result: it is reported, recorded, and repeated a few times.
 
-The bridge must fault if an emulator stalls beyond its timeout, because it cannot rule out real hardware. A real machine
-is never restarted automatically.
+A real machine is never restarted automatically.
 """
 
 from __future__ import annotations

@@ -16,11 +16,7 @@ Kind = Literal["line", "step", "points", "interval", "band"]
 
 @dataclass(frozen=True)
 class Style:
-    """Style of a role, readable in greyscale too.
-
-    Colours are from the colour-blind safe set of Okabe and Ito; ``dash`` is ``solid``, ``dash``, ``dot`` or
-    ``dashdot``, ``width`` in [pt], ``marker`` ``circle``, ``square``, ``triangle`` or ``cross``.
-    """
+    """Style of a role, readable in greyscale too, in the colours of Okabe and Ito; ``width`` in [pt]."""
 
     colour: str
     dash: str = "solid"
@@ -116,10 +112,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Figure:
-    """A figure, with a file stem (also its anchor), a sentence computed from the data, and panels.
-
-    Panels are ``stacked`` above each other on one x axis, else side by side, ``panel_height`` high [px on the page].
-    """
+    """A figure: file stem (also its anchor), a sentence computed from the data, and panels, stacked or side by side."""
 
     name: str
     title: str

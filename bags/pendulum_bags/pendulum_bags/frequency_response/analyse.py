@@ -43,11 +43,7 @@ NUMBERS = "frequency_response.json"
 def read_responses(
     paths: Sequence[Path | Reading], names: Sequence[str] = ()
 ) -> tuple[list[MeasuredResponse], str, list[str]]:
-    """Return the responses of one or two recordings or of a folder with ``sim`` and ``hw``, and the designs' plant.
-
-    The simulation comes first; joints go in the order of ``names`` or of the first recording. A BagError if a bag
-    cannot be read, a DataError if it holds no excited plant or both are of one side.
-    """
+    """Return the responses of one or two recordings or of a folder with ``sim`` and ``hw``, and the designs' plant."""
     readings = [Reading.of(path) for path in paths]
     if len(readings) == 1 and all((readings[0].path / side).is_dir() for side in ("sim", "hw")):
         readings = [replace(readings[0], path=readings[0].path / side, _cache={}) for side in ("sim", "hw")]

@@ -67,9 +67,8 @@ def record_of_arrays(arrays: RunArrays, label: str, disturbance: Mapping[str, An
 
 
 def record_of_run(run: RunData) -> Record:
-    """Return the record of a recorded plant while its disturbance acted.
+    """Return the record of a recorded plant while its disturbance acted; held torques are averaged, jitter is removed.
 
-    Held torques are averaged over each interval of the raster; angle and velocity are interpolated where stamps jitter.
     A DataError if disturbance or applied torque are missing, or states for long.
     """
     return _record(run, [run])

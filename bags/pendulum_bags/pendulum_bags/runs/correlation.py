@@ -11,10 +11,7 @@ __all__ = ["autocorrelation", "effective_size"]
 
 
 def autocorrelation(values: ArrayLike, mean: float | None = None) -> Array:
-    """Return the autocorrelation of values (n,) at lags 0 to n - 1, biased and so positive definite, shape (n,).
-
-    ``mean`` is their expectation where it is known; by default, their own mean.
-    """
+    """Return the biased, positive definite autocorrelation of values (n,), about ``mean`` if known, shape (n,)."""
     samples = np.asarray(values, dtype=float)
     centred = samples - (samples.mean() if mean is None else mean)
     size = samples.size

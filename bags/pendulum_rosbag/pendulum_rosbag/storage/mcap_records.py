@@ -1,7 +1,4 @@
-"""MCAP records as bytes (https://mcap.dev/spec), as far as rosbag2 files use them.
-
-A record is an opcode (one byte), a length (uint64) and its content, little-endian.
-"""
+"""MCAP records as bytes (https://mcap.dev/spec): opcode (one byte), length (uint64), content, little-endian."""
 
 from __future__ import annotations
 

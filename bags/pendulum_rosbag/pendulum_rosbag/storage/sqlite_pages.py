@@ -1,7 +1,4 @@
-"""Pages of an SQLite database, for tables that only grow: rows, leaves, and the tree above them.
-
-File format: https://www.sqlite.org/fileformat2.html (sections 1.6 b-tree pages, 2.1 records).
-"""
+"""Growing tables in an SQLite file (https://www.sqlite.org/fileformat2.html, 1.6 b-tree pages, 2.1 records)."""
 
 from __future__ import annotations
 
