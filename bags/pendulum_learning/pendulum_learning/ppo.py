@@ -158,12 +158,12 @@ class Ppo:
             return float(np.mean(error * error))
 
         # Actor and critic share nothing: two threads give the same bits.
-        with ThreadPoolExecutor(1) as beside:
+        with ThreadPoolExecutor(1) as executor:
             for _ in range(s.epochs):
                 order = self.generator.permutation(len(seen))
                 for part in range(s.batches):
                     rows = order[part * size : (part + 1) * size]
-                    loss = beside.submit(criticise, rows, self.rate)
+                    loss = executor.submit(criticise, rows, self.rate)
                     old = _Old(actions[rows], means[rows], chance_before[rows], before)
                     divergences.append(self._follow_advantages(seen[rows, :observed], old, advantages[rows], remaining))
                     losses.append(loss.result())

@@ -53,7 +53,7 @@ def joints(
         typer.Option(
             help="Preset or plant file of the emulated machine; emulator for one that --share and --delay draw. Or a "
             "second simulation: a model file or gymnasium:ID. Or ros:/NAMESPACE for a plant that runs already on "
-            "--domain, and that somebody holds upright."
+            "--domain, and that a person holds upright."
         ),
     ] = "emulator",
     hardware_mapping: HardwareMapping = None,

@@ -307,7 +307,7 @@ def _jackknife(runs: Sequence[_Run], statistic: Statistic, kind: _Kind) -> Jackk
     return found.of_runs(alone, [run.sizes[0] for run in runs])
 
 
-def _beside(runs: Sequence[_Run], statistic: Statistic, size: float) -> float:
+def _systematic(runs: Sequence[_Run], statistic: Statistic, size: float) -> float:
     """Return the systematic error; ``size`` is what shares are of, 1 for a logarithm."""
     values = [statistic(*run.near) for run in runs]
     late = float(np.mean([np.abs(one - one[0]).max() for one in values]))
@@ -406,8 +406,10 @@ def _mean_test(
 ) -> EquivalenceTest:
     margin = margins.mean_position if kind.slides else margins.mean_angle
     spread = max(float(_spread(above)(*run.near)[0]) for run in sides[-1])
-    found, beside = _difference(sides, lambda _, mean: mean[..., below], lambda _, mean: mean[..., above], kind, spread)
-    return _within(found, f"mean {kind.name('angle')} difference", margin, kind, beside)
+    found, systematic = _difference(
+        sides, lambda _, mean: mean[..., below], lambda _, mean: mean[..., above], kind, spread
+    )
+    return _within(found, f"mean {kind.name('angle')} difference", margin, kind, systematic)
 
 
 def _difference(
@@ -419,16 +421,16 @@ def _difference(
         def both(spread: Array, mean: Array) -> Array:
             return np.asarray(above(spread, mean) - below(spread, mean))
 
-        return _jackknife(sides[0], both, kind), _beside(sides[0], both, size)
+        return _jackknife(sides[0], both, kind), _systematic(sides[0], both, size)
     first, second = (_jackknife(runs, one, kind) for runs, one in zip(sides, (below, above), strict=True))
-    besides = [_beside(runs, one, size) for runs, one in zip(sides, (below, above), strict=True)]
-    return second.less(first), max(besides)
+    errors = [_systematic(runs, one, size) for runs, one in zip(sides, (below, above), strict=True)]
+    return second.less(first), max(errors)
 
 
-def _within(found: Jackknife, name: str, margin: Margin, kind: _Kind, beside: float = 0.0) -> EquivalenceTest:
-    """Test a statistic in SI units against a margin on both sides; ``beside`` is its systematic error."""
+def _within(found: Jackknife, name: str, margin: Margin, kind: _Kind, systematic: float = 0.0) -> EquivalenceTest:
+    """Test a statistic in SI units against a margin on both sides; ``systematic`` is its systematic error."""
     ends = -margin.value, margin.value
-    return _test(found, name, margin.unit, ends, kind, lambda value: margin.per_si * value, beside=beside)
+    return _test(found, name, margin.unit, ends, kind, lambda value: margin.per_si * value, systematic=systematic)
 
 
 def _test(
@@ -440,10 +442,10 @@ def _test(
     scale: Callable[[float], float],
     *,
     ratio: bool = False,
-    beside: float = 0.0,
+    systematic: float = 0.0,
 ) -> EquivalenceTest:
     levels = kind.looks.level, kind.looks.level_of_each
-    inside, outside = (found.interval(level, scale, beside=beside) for level in levels)
+    inside, outside = (found.interval(level, scale, systematic=systematic) for level in levels)
     return equivalence_test(name, unit, inside, *ends, outside=outside, runs=kind.runs, ratio=ratio)
 
 
@@ -466,13 +468,15 @@ def _spread_tests(
         margin: Margin = getattr(margins, f"spread_{what}")
         size = _log_spread if margin.is_share else _spread
         share = 1.0 if margin.is_share else max(float(_spread(hardware + index)(*run.near)[0]) for run in sides[-1])
-        found, beside = _difference(sides, size(simulation + index), size(hardware + index), kind, share)
+        found, systematic = _difference(sides, size(simulation + index), size(hardware + index), kind, share)
         if margin.is_share:
             top = 1.0 + margin.si
             name = f"spread of {kind.name(what)} (ratio)"
-            tests.append(_test(found, name, "-", (1.0 / top, top), kind, exponential, ratio=True, beside=beside))
+            tests.append(
+                _test(found, name, "-", (1.0 / top, top), kind, exponential, ratio=True, systematic=systematic)
+            )
         else:
-            tests.append(_within(found, f"spread of {kind.name(what)} difference", margin, kind, beside))
+            tests.append(_within(found, f"spread of {kind.name(what)} difference", margin, kind, systematic))
     return tests
 
 
@@ -491,6 +495,6 @@ def _path_test(
     factor = 100.0 if margin.is_share else margin.per_si
     found = _jackknife(runs, distance, kind)
     size = 1.0 if margin.is_share else max(float(_spread(b)(*run.near)[0]) for run in runs)
-    beside = _beside(runs, distance, size)
+    systematic = _systematic(runs, distance, size)
     ends = -math.inf, margin.value
-    return _test(found, name, margin.unit, ends, kind, lambda value: factor * max(value, 0.0), beside=beside)
+    return _test(found, name, margin.unit, ends, kind, lambda value: factor * max(value, 0.0), systematic=systematic)

@@ -118,14 +118,14 @@ class Jackknife:
         blocks = min(self.blocks, other.blocks)
         return Jackknife(self.estimate - other.estimate, math.sqrt(total), freedom, blocks, between)
 
-    def interval(self, level: float, scale: Callable[[float], float] = float, *, beside: float = 0.0) -> Interval:
+    def interval(self, level: float, scale: Callable[[float], float] = float, *, systematic: float = 0.0) -> Interval:
         """Return the interval by Student's t; ``scale`` maps estimate and ends to what is reported."""
         reach = float(student_quantile(0.5 + 0.5 * level, self.freedom)) * self.error
         if self.between:
             # Phases are uniform and their effects skewed, of which Student's t misses up to four times what it states.
             runs, tail = self.between, 0.5 * (1.0 - level)
             reach = max(reach, float(student_quantile(1.0 - 0.25 * tail, runs.freedom)) * runs.error)
-        estimate, low, high = (scale(self.estimate + side * (reach + beside)) for side in (0.0, -1.0, 1.0))
+        estimate, low, high = (scale(self.estimate + side * (reach + systematic)) for side in (0.0, -1.0, 1.0))
         return Interval(estimate, low, high, level, self.error, self.blocks)
 
 

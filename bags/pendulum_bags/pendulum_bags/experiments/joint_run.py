@@ -93,7 +93,7 @@ class JointSettings(Sides):
         if self.hardware == "hebi":
             raise ParameterError(
                 "hardware is hebi; with several joints start the bridge (python -m pendulum_hw_bridge bridge) and give "
-                "ros:/hw: somebody has to hold the plant upright"
+                "ros:/hw: a person has to hold the plant upright"
             )
         self._check_sides(self.noise.hold_time)
 

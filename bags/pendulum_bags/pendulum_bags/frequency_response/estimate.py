@@ -170,8 +170,8 @@ def _distortion(y: Complex, harmonics: NDArray[np.int64]) -> tuple[float, float]
     mean = np.mean(y, axis=1)
     noise = np.mean(np.abs(y - mean[:, None, :]) ** 2, axis=1) / max(1, y.shape[1] - 1)
     there = np.mean(np.maximum(np.abs(mean[:, odd]) ** 2 - noise[:, odd], 0.0), axis=1)
-    beside = np.mean(np.abs(mean[:, excited]) ** 2, axis=1)
-    ratio = np.sqrt(there / beside)
+    linear = np.mean(np.abs(mean[:, excited]) ** 2, axis=1)
+    ratio = np.sqrt(there / linear)
     half = ratio.size // 2
     return float(np.max(ratio[:half])), float(np.max(ratio[half:]))
 

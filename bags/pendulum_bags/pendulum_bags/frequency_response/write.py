@@ -27,8 +27,8 @@ _THEOREM = (
     "stable."
 )
 _LIMITS = (
-    "It does not cover torque that saturates, of dry friction at rest (a stuck joint does not move as a line says), "
-    "or of motions far from upright. Between measured frequencies the plant is interpolated, below the lowest its "
+    "It does not cover torque that saturates, dry friction at rest (a stuck joint does not move as a line says), "
+    "or motions far from upright. Between measured frequencies the plant is interpolated, below the lowest its "
     "stiffness, damping and inertia are continued (of several joints, its ratio to the model), and the error of both "
     "widens the discs. What begins only below the lowest frequency was not seen."
 )

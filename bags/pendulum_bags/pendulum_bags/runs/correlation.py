@@ -23,7 +23,7 @@ def autocorrelation(values: ArrayLike, mean: float | None = None) -> Array:
     return result
 
 
-def effective_size(values: ArrayLike, beside: ArrayLike | None = None) -> float:
+def effective_size(values: ArrayLike, other: ArrayLike | None = None) -> float:
     """Return how many independent samples have the same variance of the mean: n / (1 + 2 sum of rho).
 
     With a second, independent series it is the variance of the sum of their products, as in a regression: rho is the
@@ -31,7 +31,7 @@ def effective_size(values: ArrayLike, beside: ArrayLike | None = None) -> float:
     neighbouring autocorrelations is no longer positive (Geyer, Statistical Science 7, 1992, section 3.3).
     """
     # A regression without intercept has residuals about zero: their mean is an error like any other.
-    rho = autocorrelation(values) if beside is None else autocorrelation(values, 0.0) * autocorrelation(beside, 0.0)
+    rho = autocorrelation(values) if other is None else autocorrelation(values, 0.0) * autocorrelation(other, 0.0)
     size = rho.size
     pairs = rho[1 : 1 + 2 * ((size - 1) // 2)].reshape(-1, 2).sum(axis=1)
     ends = np.flatnonzero(pairs <= 0.0)

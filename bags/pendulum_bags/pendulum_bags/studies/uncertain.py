@@ -184,11 +184,11 @@ def uncertainty_of(plant_file: str) -> Uncertainty:
     shares = {name: share for name, share in known.items() if share > 0.0}
     if not shares:
         raise ParameterError(f"plant {plant_file} has no intervals; expected the file of an identification")
-    beside = Path(plant_file).with_suffix(".json")
-    if not plant.is_pendulum or not beside.is_file():
+    path = Path(plant_file).with_suffix(".json")
+    if not plant.is_pendulum or not path.is_file():
         return Uncertainty(shares, source=f"intervals of {plant_file}, taken for independent")
     try:
-        covariance = json.loads(beside.read_text(encoding="utf-8"))["covariance"]
+        covariance = json.loads(path.read_text(encoding="utf-8"))["covariance"]
         order, matrix = list(covariance["names"]), np.array(covariance["matrix"], dtype=np.float64)
         rows = [order.index(name) for name in shares]
         found = matrix[np.ix_(rows, rows)]
@@ -197,7 +197,7 @@ def uncertainty_of(plant_file: str) -> Uncertainty:
         correlation = found / np.outer(deviations, deviations)
     except (OSError, ValueError, KeyError, TypeError, IndexError) as error:
         raise ParameterError(
-            f"{beside} has no covariance of {', '.join(shares)} ({error}); expected the JSON that identify --out wrote"
+            f"{path} has no covariance of {', '.join(shares)} ({error}); expected the JSON that identify --out wrote"
         ) from error
     shares = {name: float(min(1.0, share)) for name, share in zip(shares, deviations / values, strict=True)}
-    return Uncertainty(shares, correlation.tolist(), f"covariance of {beside}")
+    return Uncertainty(shares, correlation.tolist(), f"covariance of {path}")
