@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import sys
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -509,6 +510,30 @@ def test_objects_of_matlab_need_their_library(tmp_path: Path, monkeypatch: pytes
             Reading(tmp_path / f"{version}.mat").columns  # noqa: B018
     # What that sentence has MATLAB make.
     np.testing.assert_allclose(Reading(tmp_path / "struct.mat").motion.joints[0].position, RUN["position"])
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_a_long_recording_is_in_memory_once(tmp_path: Path, unit: str) -> None:
+    count = 200_000
+    t = 0.001 * np.arange(count)
+    columns = {"time": t, "angle": np.sin(t), "speed": np.cos(t), "torque": np.cos(3.0 * t)}
+    np.savez(tmp_path / "run.npz", **columns)
+    mapping = {
+        "time": {"column": "time", "unit": "s"},
+        "position": {"column": "angle", "unit": unit},
+        "velocity": {"column": "speed", "unit": f"{unit}/s"},
+        "input": {"column": "torque", "unit": "N m"},
+    }
+    reading = Reading(tmp_path / "run.npz", mapping)
+    assert reading.columns.columns.keys() == columns.keys()
+    Reading(tmp_path / "run.npz", mapping).motion  # noqa: B018 (what is imported late is no part of it)
+    tracemalloc.start()
+    motion = reading.motion
+    held, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert motion.time.size == count
+    assert held < 4.2 * 8 * count
+    assert peak < 6.0 * 8 * count
 
 
 def test_a_log_of_simulink_from_a_real_lab_is_read(shared_data: Path) -> None:

@@ -73,9 +73,12 @@ class Columns:
             self._values[name] = np.ascontiguousarray(self.columns[name].read(slice(None)), dtype=float).reshape(-1)
         return self._values[name]
 
-    def forget(self) -> None:
-        """Release the memory of the columns that were read; they are read again when they are asked for."""
-        self._values.clear()
+    def forget(self, name: str = "") -> None:
+        """Release the memory of a column, or of all; they are read again when they are asked for."""
+        if name:
+            self._values.pop(name, None)
+        else:
+            self._values.clear()
 
     def stretch(self, rows: int) -> Columns:
         """Return the middle of a long recording: so many rows of its longest column, the others in proportion."""

@@ -402,7 +402,7 @@ class _Reader:
         self._check_stated(clock, unit)
         if clock.name not in self.stamps:
             start = _number("start", section, "time", self.origin)
-            self.stamps[clock.name] = (self.columns.values(clock.name) - start) * factor(unit, "time", where)
+            self.stamps[clock.name] = _scaled(self.columns.values(clock.name), -start, factor(unit, "time", where))
         return clock.name, self.stamps[clock.name]
 
     def _rows(self, base: _Track, tracks: Sequence[tuple[str, _Track]]) -> NDArray[np.bool_]:
@@ -446,9 +446,11 @@ class _Reader:
         if sign not in (1, -1):
             raise DataError(f"{self.origin}: sign of {key} is {sign!r}; expected 1 or -1")
         self._refuse_holes(track.column.name, track.values, rows)
-        values = track.values[_chosen(rows)] + _number("offset", section, key, self.origin)
-        values *= sign * size
-        return np.asarray(values)
+        values = _scaled(track.values[_chosen(rows)], _number("offset", section, key, self.origin), sign * size)
+        # Of a long recording the column and its copy are not held together for all quantities.
+        self.columns.forget(track.column.name)
+        track.values = values
+        return values
 
     def _apart(self, track: _Track, key: str, quantity: str) -> tuple[Array, Array]:
         """Return stamps and values of what has rows of its own."""
@@ -482,6 +484,15 @@ class _Reader:
         return Drive(stamps, values, quantity, hold, track.apart, assumed)
 
 
+def _scaled(values: Array, offset: float, size: float) -> Array:
+    """Return size (values + offset) by one copy; the values themselves where it changes nothing."""
+    if offset == 0.0 and size == 1.0:
+        return values
+    found = values + offset
+    found *= size
+    return found
+
+
 def _chosen(rows: NDArray[np.bool_]) -> _Rows:
     """Return an index of rows that copies nothing where it chooses all."""
     return slice(None) if rows.all() else rows
@@ -504,7 +515,11 @@ def _number(key: str, section: Mapping[str, Any], name: str, origin: str) -> flo
 
 def _check_step(source: Path, time: Array) -> None:
     """Refuse stamps that can hardly be in the unit that the mapping claims."""
-    if time.size > 1 and (step := float(np.median(np.abs(np.diff(time))))) >= 1.0:
+    if time.size < 2:
+        return
+    steps = np.diff(time)
+    np.abs(steps, out=steps)
+    if (step := float(np.median(steps, overwrite_input=True))) >= 1.0:
         raise DataError(f"{source}: the median time step is {step:.3g} s; expected < 1 s: is the unit ms, us or ns?")
 
 

@@ -142,7 +142,8 @@ _APART, _BACK, _SHARE = 0.05, 0.2, 0.12
 
 def two_motions(position: npt.NDArray[Any]) -> str:
     """Return how an angle, shape (n,) [rad], jumps to and fro if two senders share a topic, in words."""
-    known = position[np.isfinite(position)]
+    finite = np.isfinite(position)
+    known = position if finite.all() else position[finite]
     steps = np.diff(known)
     if max(float(np.max(steps, initial=0.0)), -float(np.min(steps, initial=0.0))) <= _APART:
         return ""
