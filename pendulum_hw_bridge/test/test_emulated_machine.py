@@ -20,7 +20,7 @@ from pendulum_testing.joint_plants import without_friction
 
 MILLISECOND = 1_000_000
 SECOND = 1_000_000_000
-PRESETS = ("cart_pole", "acrobot", "pendubot", "double_pendulum", "furuta")
+PRESETS = ("cart_pole", "acrobot", "pendubot", "double_pendulum", "furuta", "qube_servo")
 INSTANT = QuasiDirectDrive(current_loop=0.0, command_delay=0.0, feedback_delay=0.0)
 
 
@@ -223,7 +223,7 @@ def test_a_limit_lowers_what_a_drive_makes_and_cannot_raise_it() -> None:
     assert isinstance(elbow, DrivePort)
     for asked, kept in ((2.0, 2.0), (100.0, 6.0)):
         elbow.set_limits(replace(elbow.connect().limits, effort=asked))
-        assert machine.drives[0].effort_limit == kept
+        assert machine.drives[0].limit == kept
 
 
 def test_a_delay_of_the_plant_file_is_inside_the_drive_and_a_stop_does_not_wait_for_it() -> None:

@@ -79,7 +79,7 @@ def failed(found: Checklist) -> list[str]:
     return [item.name for item in found.items if not item.passed]
 
 
-@pytest.mark.parametrize("plant", ["cart_pole", "acrobot", "pendubot", "double_pendulum", "furuta"])
+@pytest.mark.parametrize("plant", ["cart_pole", "acrobot", "pendubot", "double_pendulum", "furuta", "qube_servo"])
 def test_a_healthy_machine_passes_the_lines_of_each_joint_and_no_motor_gets_an_effort(plant: str) -> None:
     machine = Machine(plant)
     found = machine.checked()

@@ -544,7 +544,6 @@ def test_two_huge_torques_of_opposite_sign_stay_finite() -> None:
     ],
 )
 def test_limits_that_limit_nothing_or_everything_are_refused(name: str, value: float) -> None:
+    several = name in {"effort", "push", "position_min", "position_max"}
     with pytest.raises(ParameterError, match="expected"):
-        PlantLimits(
-            **{"effort": (5.0,), name: (value,) if name in {"effort", "position_min", "position_max"} else value}
-        )
+        PlantLimits(**{"effort": (5.0,), name: (value,) if several else value})

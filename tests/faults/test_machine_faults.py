@@ -113,7 +113,7 @@ def test_the_lqr_of_the_simulated_plant_holds_the_emulated_machine_upright(plant
     assert all(abs(e) <= limit for o in machine.outcomes for e, limit in zip(o.effort, limits, strict=True))
 
 
-@pytest.mark.parametrize("plant", ["cart_pole", "acrobot", "pendubot", "double_pendulum", "furuta"])
+@pytest.mark.parametrize("plant", ["cart_pole", "acrobot", "pendubot", "double_pendulum", "furuta", "qube_servo"])
 def test_nothing_moves_before_somebody_arms(plant: str) -> None:
     machine = Machine(plant)
     machine.cycles(20)

@@ -14,7 +14,7 @@ _MILLISECOND = 1_000_000
 INSTANT = QuasiDirectDrive(current_loop=0.0, command_delay=0.0, feedback_delay=0.0)
 
 
-@pytest.mark.parametrize("plant", ["cart_pole", "acrobot", "pendubot", "double_pendulum", "furuta"])
+@pytest.mark.parametrize("plant", ["cart_pole", "acrobot", "pendubot", "double_pendulum", "furuta", "qube_servo"])
 def test_without_lag_and_delay_it_moves_as_the_simulated_plant_does(plant: str) -> None:
     parameters = load_mechanism(plant)
     start = tuple(0.3 if joint.turns else 0.1 for joint in parameters.coordinates.joints)
@@ -25,9 +25,11 @@ def test_without_lag_and_delay_it_moves_as_the_simulated_plant_does(plant: str) 
     generator = np.random.default_rng(3)
     for step in range(300):
         if step % 10 == 0:
-            effort = tuple(float(generator.uniform(-1.5, 1.5)) * limit for limit in parameters.effort_limits)
-            for index, value in enumerate(effort):
-                machine.deliver(index, value, step * _MILLISECOND)
+            shares = [float(generator.uniform(-1.5, 1.5)) for _ in machine.drives]
+            effort = tuple(share * limit for share, limit in zip(shares, parameters.command_limits, strict=True))
+            for index, share in enumerate(shares):
+                # Of a motor in volts the setpoint is a duty.
+                machine.deliver(index, share * machine.largest[index], step * _MILLISECOND)
         state = simulated.step(effort)
         machine.advance_to((step + 1) * _MILLISECOND - 1)
         machine.advance_to((step + 1) * _MILLISECOND, wholly=True)

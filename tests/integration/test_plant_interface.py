@@ -561,7 +561,10 @@ def test_last_words_wait_to_be_heard_without_pythons_lock_and_a_torque_under_way
         get_subscription_count=lambda: 0, wait_for_all_acked=lambda longest: asked.append(longest.nanoseconds)
     )
     stopping = SimpleNamespace(
-        supervisor=SimpleNamespace(report_applied=lambda effort: None), applied_publisher=publisher, _stopping=True
+        supervisor=SimpleNamespace(report_applied=lambda effort: None),
+        applied_publisher=publisher,
+        _stopping=True,
+        _motor_efforts=None,
     )
     # Decided before the stop: its thread has the drive still to release.
     PlantInterface.publish_applied(stopping, 0, (1.0,))  # type: ignore[arg-type]

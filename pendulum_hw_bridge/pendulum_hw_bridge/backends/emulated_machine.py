@@ -24,7 +24,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS
 __all__ = ["DrivePort", "JointPort", "machine_ports"]
 
 TORQUE_LOOP = Strategy.PARALLEL_PWM
-"""The only strategy of these drives besides off: an effort setpoint for a current loop."""
+"""Strategy of drives with a current loop, which take an effort; those of motors in volts take a duty."""
 
 
 class JointPort:
@@ -102,6 +102,8 @@ class DrivePort(JointPort):
             effort=machine.plant.effort_limits[self._motor], joint=machine.coordinates.joints[index]
         )
         self._gains = DEFAULT_GAINS[TORQUE_LOOP]
+        self._volts = machine.coordinates.volts
+        self._loop = Strategy.DIRECT_PWM if self._volts else TORQUE_LOOP
         self._strategy = Strategy.OFF
 
     @property
@@ -121,28 +123,27 @@ class DrivePort(JointPort):
         )
 
     def write(self, command: Command) -> Applied:
-        """Send a torque, which arrives after the transport delay."""
+        """Send a torque or duty, which arrives after the transport delay."""
         self._require_connection()
         if ActuatorFault.SEND_FAILED in self._faults:
             raise ActuatorError("send_failed", "command could not be sent: the network refuses it")
         limited, changed = self._checked(command, self._strategy)
         now = self.now_ns()
-        self.machine.deliver(self._motor, limited.effort, now)
+        self.machine.deliver(self._motor, limited.pwm if self._volts else limited.effort, now)
         return Applied(limited, self._strategy, changed, now)
 
     def set_strategy(self, strategy: Strategy, command: Command | None = None) -> Strategy:
         """Switch on with a first torque, or off."""
         self._require_reach("strategy")
-        if strategy not in {Strategy.OFF, TORQUE_LOOP}:
-            raise ActuatorError(
-                "strategy", f"strategy is {strategy.name}; expected OFF or {TORQUE_LOOP.name}, the loop of torque"
-            )
+        if strategy not in {Strategy.OFF, self._loop}:
+            takes = "duty" if self._volts else "the loop of torque"
+            raise ActuatorError("strategy", f"strategy is {strategy.name}; expected OFF or {self._loop.name}, {takes}")
         limited = None if command is None else self._checked(command, strategy)[0]
         now = self.now_ns()
         self.machine.switch(self._motor, now, on=strategy is not Strategy.OFF)
         self._strategy = strategy
         if limited is not None and strategy is not Strategy.OFF:
-            self.machine.deliver(self._motor, limited.effort, now)
+            self.machine.deliver(self._motor, limited.pwm if self._volts else limited.effort, now)
         return self._strategy
 
     def set_gains(self, gains: GainSet) -> GainSet:
@@ -155,8 +156,9 @@ class DrivePort(JointPort):
         """Set the limits; the effort limit cannot exceed the drive's own."""
         self._require_reach("limits")
         self._limits = limits
-        self.machine.drives[self._motor].effort_limit = min(
-            limits.effort, self.machine.plant.effort_limits[self._motor]
+        largest, full = self.machine.largest[self._motor], self.machine.plant.effort_limits[self._motor]
+        self.machine.drives[self._motor].limit = (
+            largest * min(1.0, limits.effort / full) if self._volts else min(limits.effort, full)
         )
         return self._limits
 

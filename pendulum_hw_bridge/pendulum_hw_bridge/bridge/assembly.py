@@ -13,8 +13,9 @@ from pendulum_hw_bridge.bridge import bridge_parameters
 from pendulum_hw_bridge.bridge.bridge_consistency import check_consistency
 from pendulum_hw_bridge.bridge.group_assembly import OF_GROUPS, GroupAssembly, refuse_slides
 from pendulum_hw_bridge.bridge.module import DrivenModule, Module
-from pendulum_hw_bridge.drive.current_drive import CurrentCheck, CurrentMapping
+from pendulum_hw_bridge.drive.current_drive import CurrentCheck, CurrentMapping, VoltageMapping
 from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrategy
+from pendulum_hw_bridge.drive.output_check import OutputCheck
 from pendulum_hw_bridge.drive.safety import SafetyLimits, SafetyMonitor
 from pendulum_hw_bridge.emulation.machine import EmulatedMachine
 from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
@@ -23,11 +24,12 @@ from pendulum_hw_bridge.port.clocks import Clock
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_hw_bridge.port.settings import BridgeSettings
 from pendulum_msgs_py.contract.drive import PlantLimits
-from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates, Joint
 from pendulum_msgs_py.contract.plant_specs import in_units_of
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.plants.joint_parameters import Actuator
 from pendulum_msgs_py.plants.plant_parameters import (
     MECHANISM_PRESETS,
     PlantParameters,
@@ -40,6 +42,8 @@ __all__ = ["CURRENT_LOOP", "Assembly", "assemble", "for_plant"]
 
 CURRENT_LOOP = "current_loop"
 """Reported in place of a value of ``effort_strategy`` for drives with a current loop."""
+AMPLIFIER = "amplifier"
+"""The same for motors in volts."""
 _MEASURED_SHARE = 1.2
 """Limit of the measured effort, as a multiple of the effort limit [-]."""
 _DISAGREEMENT = 0.05
@@ -159,6 +163,11 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
             f"backend {values['backend']!r} has one module, and plant {plant.name!r} has the joints {names}; expected "
             "backend 'emulator' or 'hebi'"
         )
+    if real and coordinates.volts:
+        raise ParameterError(
+            f"plant {plant.name!r} is driven in volts; expected one driven by an effort: so are the modules of backend "
+            f"{values['backend']!r}"
+        )
     if real:
         refuse_slides(coordinates)
     if not coordinates.driven:
@@ -172,7 +181,7 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
                 f"{names}; expected it left out"
             )
     limits = bridge_parameters.supervisor_limits(
-        values, plant.effort_limits, coordinates=coordinates, lockstep=lockstep
+        values, plant.command_limits, push=plant.effort_limits, coordinates=coordinates, lockstep=lockstep
     )
     check_consistency(values, limits)
     if real:
@@ -189,17 +198,11 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
                 "torque that is no longer commanded may still be measured"
             )
     mappings = [
-        CurrentMapping(
-            EffortStrategy.EFFORT_LOOP,
-            hardware.constants(coordinates.joints[index], actuator.effort_limit),
-            gains=gains,
-            effort_limit=limit,
-            joint=coordinates.joints[index],
-            # After the delay, the rest of an older torque decays to a twentieth within three time constants.
-            late=math.ceil((delay + 3.0 * actuator.time_constant) * values["feedback_rate"]),
-        )
+        _mapping(hardware, coordinates.joints[index], actuator, limit, delay, values["feedback_rate"])
         for index, actuator, limit in zip(coordinates.driven, plant.actuators, limits.effort, strict=True)
     ]
+    # A duty that is late, or partly without effect, contradicts the current.
+    tells = not (delay or any(own.motor is not None and own.motor.dead_band > 0.0 for own in plant.actuators))
 
     def modules(clock: Clock) -> list[Module]:
         start_ns = clock.now_ns()
@@ -212,11 +215,17 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
         for index, port in enumerate(machine_ports(machine, clock)):
             joint = coordinates.joints[index].name
             driven = coordinates.driven.index(index) if isinstance(port, DrivePort) else None
-            effort = limits.effort[driven] if driven is not None else max(limits.effort)
+            effort = mappings[driven].effort_limit if driven is not None else max(m.effort_limit for m in mappings)
+            safety = _safety(values, effort)
+            if driven is not None and (motor := plant.actuators[driven].motor) is not None:
+                # A motor that is reversed at speed gets the back EMF on top.
+                braking = motor.damping * (limits.velocity if math.isfinite(limits.velocity) else _FASTEST)
+                most = values["measured_effort_limit"] or _MEASURED_SHARE * (effort + braking)
+                safety = replace(safety, measured_effort=most)
             monitor = SafetyMonitor(
-                _safety(values, effort),
+                safety,
                 period_ns / NANOSECONDS,
-                mappings[driven].drivetrain if driven is not None else None,
+                mappings[driven].drivetrain if driven is not None and (tells or not coordinates.volts) else None,
                 coordinates.joints[index],
             )
             settings = BridgeSettings(
@@ -235,10 +244,36 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
                 made.append(Module(port, monitor, settings, joint=joint))
                 continue
             assert isinstance(port, DrivePort)
-            made.append(DrivenModule(port, mappings[driven], monitor, settings, joint=joint, check=CurrentCheck))
+            check = OutputCheck if coordinates.volts else CurrentCheck
+            made.append(DrivenModule(port, mappings[driven], monitor, settings, joint=joint, check=check))
         return made
 
-    return Assembly(coordinates, limits, [plant], f"emulated machine {plant.name}", CURRENT_LOOP, mappings[0], modules)
+    strategy = AMPLIFIER if coordinates.volts else CURRENT_LOOP
+    return Assembly(coordinates, limits, [plant], f"emulated machine {plant.name}", strategy, mappings[0], modules)
+
+
+def _mapping(
+    hardware: QuasiDirectDrive, joint: Joint, actuator: Actuator, limit: float, delay: float, rate: float
+) -> EffortMapping:
+    """Return the mapping of a drive's commands within a limit [N m or N, or V], for a delay [s] and a rate [Hz]."""
+    constants, motor = hardware.constants(joint, actuator.effort_limit, actuator.motor), actuator.motor
+    if motor is not None:
+        return VoltageMapping(
+            EffortStrategy.DIRECT_PWM,
+            constants,
+            gains=DEFAULT_GAINS[TORQUE_LOOP],
+            effort_limit=limit * motor.gain,
+            joint=joint,
+        )
+    return CurrentMapping(
+        EffortStrategy.EFFORT_LOOP,
+        constants,
+        gains=DEFAULT_GAINS[TORQUE_LOOP],
+        effort_limit=limit,
+        joint=joint,
+        # After the delay, the rest of an older torque decays to a twentieth within three time constants.
+        late=math.ceil((delay + 3.0 * actuator.time_constant) * rate),
+    )
 
 
 def _group(values: Mapping[str, Any], plant: PlantParameters, limits: PlantLimits, *, lockstep: bool) -> Assembly:

@@ -191,9 +191,14 @@ def effort_mapping(
 
 
 def supervisor_limits(
-    values: Mapping[str, Any], effort_limits: Vector, *, coordinates: Coordinates = ONE_JOINT, lockstep: bool = False
+    values: Mapping[str, Any],
+    limits: Vector,
+    *,
+    push: Vector = (),
+    coordinates: Coordinates = ONE_JOINT,
+    lockstep: bool = False,
 ) -> PlantLimits:
-    """Return the supervisor's limits; ``effort_limits`` [N m or N] are the plant file's for the driven joints.
+    """Return the supervisor's limits; ``limits`` are the plant file's of the driven joints' commands.
 
     Raises:
         ParameterError: They contradict each other or the plant.
@@ -201,7 +206,7 @@ def supervisor_limits(
     # One period more than the monitor's timeout: the monitor names the fault first, this one backs it up.
     patience = (values["feedback_watchdog"] + 1) / values["feedback_rate"]
     return limits_from_parameters(
-        values, effort_limits, coordinates=coordinates, lockstep=lockstep, feedback_timeout=patience
+        values, limits, push=push, coordinates=coordinates, lockstep=lockstep, feedback_timeout=patience
     )
 
 

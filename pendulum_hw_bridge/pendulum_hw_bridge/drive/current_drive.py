@@ -1,4 +1,4 @@
-"""Drives with a current loop: torque is commanded directly, and the measured effort must follow it."""
+"""Drives with a current loop: torque is commanded directly, and the measured effort must follow it; and amplifiers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pendulum_hw_bridge.drive.output_check import OutputCheck
 from pendulum_hw_bridge.port.actuator import Command, Feedback, Strategy
 from pendulum_hw_bridge.port.gains import GainSet
 
-__all__ = ["CurrentCheck", "CurrentMapping"]
+__all__ = ["CurrentCheck", "CurrentMapping", "VoltageMapping"]
 
 _RECORDS = 4
 _WRONG = 3
@@ -42,6 +42,19 @@ class CurrentMapping(EffortMapping):
     def limited_gains(self, voltage: float) -> GainSet:
         """Return the gains unchanged: the current loop has none that can be set."""
         return self.gains
+
+
+@dataclass(frozen=True)
+class VoltageMapping(EffortMapping):
+    """A plant in volts: its commands to the duty of the amplifier, under direct PWM and within the effort limit."""
+
+    def command(self, effort: float, motor: MotorState) -> Command:
+        """Return the duty of a voltage [V]."""
+        return Command(pwm=effort / motor.voltage)
+
+    def effort_of(self, command: Command, motor: MotorState, pwm_in_force: float) -> float:
+        """Return the voltage of a duty [V]."""
+        return 0.0 if math.isnan(command.pwm) else command.pwm * motor.voltage
 
 
 class CurrentCheck(OutputCheck):

@@ -35,10 +35,10 @@ _KEPT = 1000
 
 
 class _Drive:
-    """State of one drive: off, or with a torque in force until its lifetime ends."""
+    """State of one drive: off, or with a setpoint in force until its lifetime ends, a torque or of a motor a duty."""
 
-    def __init__(self, effort_limit: float) -> None:
-        self.effort_limit = effort_limit
+    def __init__(self, limit: float) -> None:
+        self.limit = limit
         self.on = False
         self.accepted = math.nan
         self.effort = math.nan
@@ -88,22 +88,26 @@ class EmulatedMachine:
         still = (0.0,) * len(joints)
         self.push = still
         self.faults: list[set[ActuatorFault]] = [set() for _ in joints]
-        self.drives = tuple(_Drive(limit) for limit in plant.effort_limits)
-        for drive in self.drives:
-            drive.temperature = own.ambient
         # The same delay for all drives: torques act in the order of arrival.
         self._delay = common_delay(plant)
         self.constants = tuple(
-            own.constants(joints[index], limit)
-            for index, limit in zip(self.coordinates.driven, plant.effort_limits, strict=True)
+            own.constants(joints[index], actuator.effort_limit, actuator.motor)
+            for index, actuator in zip(self.coordinates.driven, plant.actuators, strict=True)
         )
+        self.largest = tuple(
+            actuator.command_limit / (constants.supply_voltage if actuator.motor is not None else 1.0)
+            for actuator, constants in zip(plant.actuators, self.constants, strict=True)
+        )
+        """Largest setpoint of each drive [N m or N, of a motor -]."""
+        self.drives = tuple(map(_Drive, self.largest))
+        for drive in self.drives:
+            drive.temperature = own.ambient
+        self._behind = plant.torque_plant
         self._position = self.plant.check_start(still if position is None else position)
         self._velocity = self._effort = still
-        table = pack_joints(plant)
-        lags = (
-            max(lag, own.current_loop if index in self.coordinates.driven else 0.0)
-            for index, lag in enumerate(table[LAG])
-        )
+        table = pack_joints(self._behind)
+        loop = 0.0 if self.coordinates.volts else own.current_loop
+        lags = (max(lag, loop if index in self.coordinates.driven else 0.0) for index, lag in enumerate(table[LAG]))
         self._table = (*table[:LAG], tuple(lags))
         self._along, self._put, self._lag = joint_functions(len(joints))
         self._steps = [own.step(joint, driven=index in self.coordinates.driven) for index, joint in enumerate(joints)]
@@ -121,7 +125,7 @@ class EmulatedMachine:
     @property
     def state(self) -> tuple[Vector, Vector, Vector]:
         """True positions, velocities and drive efforts (0 at passive joints) at the last event."""
-        return self._position, self._velocity, self._effort
+        return self._position, self._velocity, self.coordinates.spread(self._net())
 
     @property
     def rate(self) -> float:
@@ -155,7 +159,10 @@ class EmulatedMachine:
         self.drives[index].lifetime = check_lifetime(lifetime)
 
     def deliver(self, index: int, effort: float, sent_ns: int) -> None:
-        """Send a torque [N m or N], NaN for none, at ``sent_ns`` [ns]; it acts after command and transport delay."""
+        """Send a torque [N m or N], to a motor a duty [-], NaN for none, at ``sent_ns`` [ns].
+
+        It acts after command and transport delay.
+        """
         self._deliveries += 1
         arrival_ns = sent_ns + round(self.hardware.command_delay * NANOSECONDS)
         heapq.heappush(self._inbox, (arrival_ns, self._deliveries, index, effort))
@@ -214,9 +221,9 @@ class EmulatedMachine:
 
     def _flow(self, time_ns: int) -> None:
         """Integrate up to a time, between events."""
-        plant = self.plant
+        plant = self._behind
         forward, p = plant.mechanism.forward, plant.packed
-        command = self.coordinates.spread(tuple(drive.commanded for drive in self.drives))
+        command = self.coordinates.spread(self._stall())
         while self._now_ns < time_ns:
             step_ns = min(_STEP_NS, time_ns - self._now_ns)
             h = step_ns / NANOSECONDS
@@ -238,10 +245,23 @@ class EmulatedMachine:
     def _electric(self, index: int) -> tuple[float, float]:
         """Return current [A] and resistance [ohm] of a winding."""
         constants = self.constants[index]
-        current = self._effort[self.coordinates.driven[index]] / (constants.gear_ratio * constants.torque_constant)
+        current = self._net()[index] / (constants.gear_ratio * constants.torque_constant)
         return current, winding_resistance_at(
             self.drives[index].temperature, constants.winding_resistance, constants.resistance_temperature_coefficient
         )
+
+    def _stall(self) -> Vector:
+        """Return the efforts of the drives at standstill [N m or N]."""
+        commands = tuple(drive.commanded for drive in self.drives)
+        if not self.coordinates.volts:
+            return commands
+        volts = (duty * own.supply_voltage for duty, own in zip(commands, self.constants, strict=True))
+        return self.plant.stall_efforts(tuple(volts))
+
+    def _net(self) -> Vector:
+        """Return the efforts of the drives, of motors less their back EMF [N m or N]."""
+        driven = tuple(self._effort[index] for index in self.coordinates.driven)
+        return self.plant.motor_efforts(driven, self._velocity) if self.coordinates.volts else driven
 
     def _end(self, index: int) -> None:
         """End a drive's torque, including delayed ones."""
@@ -267,7 +287,7 @@ class EmulatedMachine:
         drive, joint = self.drives[index], self.coordinates.driven[index]
         if not drive.on or ActuatorFault.COMMANDS_LOST in self.faults[joint]:
             return
-        limit = drive.effort_limit
+        limit = drive.limit
         # NaN is no torque: clamping would turn it into full torque.
         drive.accepted = min(limit, max(-limit, effort)) if math.isfinite(effort) else math.nan
         drive.expires_ns = arrival_ns + round(drive.lifetime * NANOSECONDS)
@@ -320,10 +340,16 @@ class EmulatedMachine:
         current, resistance = self._electric(motor)
         back_emf = constants.back_emf_constant * constants.gear_ratio * velocity
         # When off, the motor's bridge is open: no duty, and no current at any speed.
-        duty = (resistance * current + back_emf) / own.supply_voltage if drive.on else math.nan
+        supply, setpoint, scale = own.supply_voltage, drive.accepted, drive.limit
+        duty = (resistance * current + back_emf) / supply
+        if self.coordinates.volts:
+            supply, setpoint, scale = constants.supply_voltage, math.nan, self.plant.effort_limits[motor]
+            duty = 0.0 if math.isnan(drive.accepted) else drive.accepted
+        duty = duty if drive.on else math.nan
         return record._replace(
-            effort=self._effort[index] + own.effort_noise * drive.effort_limit * of_effort,
-            effort_command=drive.accepted,
+            effort=self._net()[motor] + own.effort_noise * scale * of_effort,
+            effort_command=setpoint,
+            voltage=supply,
             pwm_command=duty,
             motor_current=duty * current if drive.on else 0.0,
             winding_current=current,

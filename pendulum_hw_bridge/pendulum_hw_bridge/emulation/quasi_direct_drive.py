@@ -1,17 +1,18 @@
 """Drivetrain of an emulated machine of several joints: a strong motor with low gear ratio and current loop.
 
 An X5-9 turns at 1.5 rad/s and brakes with 11.8 N m s/rad, too slow to swing up several joints. Quasi-direct drives
-command torque through the current, with a lag of 1 ms. Source of the magnitudes: B. Katz, A low cost modular actuator
+command torque through the current, with a lag of 1 ms. A motor of the plant file has an amplifier in place of it, whose
+duty is a share of the supply voltage. Source of the magnitudes: B. Katz, A low cost modular actuator
 for dynamic robots, 2018.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from pendulum_msgs_py.contract.joints import Joint
-from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
+from pendulum_msgs_py.plants.joint_parameters import Motor, SeriesElasticParameters
 
 __all__ = ["QuasiDirectDrive"]
 
@@ -60,11 +61,14 @@ class QuasiDirectDrive:
         """Return the resolution of a joint's encoder [rad or m]."""
         return 2.0 * math.pi / self.encoder_counts * self.scale(joint) / (self.gear_ratio if driven else 1.0)
 
-    def constants(self, joint: Joint, effort_limit: float) -> SeriesElasticParameters:
-        """Return motor and gears of a joint with an effort limit [N m or N], for the bridge's checks; no spring."""
+    def constants(self, joint: Joint, effort_limit: float, motor: Motor | None = None) -> SeriesElasticParameters:
+        """Return motor and gears of a joint with an effort limit [N m or N], for the bridge's checks; no spring.
+
+        A ``motor`` has its own, and a supply that reaches its largest voltage.
+        """
         gear_ratio = self.gear_ratio / self.scale(joint)
         per_ampere = effort_limit / self.peak_current / gear_ratio
-        return SeriesElasticParameters(
+        constants = SeriesElasticParameters(
             gear_ratio=gear_ratio,
             torque_constant=per_ampere,
             back_emf_constant=per_ampere,
@@ -72,4 +76,17 @@ class QuasiDirectDrive:
             winding_temperature=self.ambient,
             supply_voltage=self.supply_voltage,
             efficiency=1.0,
+        )
+        if motor is None:
+            return constants
+        own = motor.torque_constant if motor.back_emf_constant is None else motor.back_emf_constant
+        return replace(
+            constants,
+            gear_ratio=motor.gear_ratio,
+            torque_constant=motor.torque_constant,
+            back_emf_constant=own,
+            winding_resistance=motor.resistance,
+            # The plant's equation has one resistance, warm or cold.
+            resistance_temperature_coefficient=0.0,
+            supply_voltage=max(self.supply_voltage, motor.voltage_limit),
         )

@@ -94,6 +94,7 @@ class BridgeNode(LifecycleNode, PollingNode):
             self._withdraw,
             lambda: self._interface.measured(),  # noqa: PLW0108  # made below
             coordinates=assembly.coordinates,
+            follows=not assembly.coordinates.volts,
         )
         self._lockstep_loop: LockstepLoop | None = None
         self._interface = PlantInterface(
@@ -107,6 +108,7 @@ class BridgeNode(LifecycleNode, PollingNode):
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,
             on_command=self._on_command,
+            motor_efforts=assembly.described[0].voltage_efforts if assembly.coordinates.volts else None,
         )
         if not self._lockstep:
             self._interface.watch_inputs()

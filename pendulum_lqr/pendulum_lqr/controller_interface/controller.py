@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 from pendulum_lqr.controller_interface.interface import Controller
@@ -34,6 +35,7 @@ __all__ = [
     "LawController",
     "Row",
     "SoftStart",
+    "VoltageOutput",
     "controller_class",
     "controller_names",
     "controller_parameters",
@@ -241,6 +243,37 @@ class SoftStart(Controller):
         self.inner.carry_over(previous)
 
 
+class VoltageOutput(Controller):
+    """Converts the efforts of a controller of the plant behind the motors to volts; dead bands stay uncompensated."""
+
+    def __init__(self, inner: Controller, plant: PlantParameters) -> None:
+        limits = zip(plant.command_limits, inner.effort_limits, plant.gains, strict=True)
+        super().__init__(tuple(min(volts, effort / gain) for volts, effort, gain in limits))
+        self.inner: Controller = inner
+        self._gains = plant.gains
+
+    def reset(self) -> None:
+        """Forget everything."""
+        self.inner.reset()
+
+    def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
+        """Return the voltages of the inner controller's efforts [V]."""
+        efforts = self.inner.efforts(t, position, velocity)
+        return tuple(effort / gain for effort, gain in zip(efforts, self._gains, strict=True))
+
+    def check(self, period: float) -> None:
+        """Check the inner controller."""
+        self.inner.check(period)
+
+    def describe(self) -> str:
+        """Return the inner controller's line, in efforts."""
+        return f"{self.inner.describe()}, efforts given as volts"
+
+    def carry_over(self, previous: Controller) -> None:
+        """Take over the previous controller's state."""
+        self.inner.carry_over(previous)
+
+
 def controller_names(*, several: bool = False) -> list[str]:
     """Return the names of the controllers for plants of one joint, or of several."""
     return [name for name, row in CONTROLLERS.items() if _target(row, several=several)]
@@ -288,7 +321,13 @@ def _target(row: Row, *, several: bool) -> str:
 def controller_parameters(name: str, plant: PlantParameters | None = None) -> tuple[ParameterSpec, ...]:
     """Return the specs of a controller for a plant (None: any of one joint), common ones first unless overridden."""
     kind = controller_class(name, plant)
-    own = kind.parameters(plant)
+    if plant is not None and plant.coordinates.volts and not kind.IN_VOLTS:
+        own = tuple(
+            replace(spec, unit="V") if spec.name == "effort_limit" else spec
+            for spec in kind.parameters(plant.torque_plant)
+        )
+    else:
+        own = kind.parameters(plant)
     common = COMMON_PARAMETERS if plant is None or plant.is_pendulum else (START_TIME,)
     names = {spec.name for spec in own}
     return (*(spec for spec in common if spec.name not in names), *own)
@@ -322,7 +361,11 @@ def make_controller(
         raise ParameterError(f"period is {period} s; expected a finite value > 0")
     if plant.is_pendulum:
         p["effort_limit"] = min(p["effort_limit"] or math.inf, plant.effort_limit)
-    designed = kind.design(plant, period, p)
+    if plant.coordinates.volts and not kind.IN_VOLTS:
+        limit = {"effort_limit": p["effort_limit"] * min(plant.gains)} if "effort_limit" in p else {}
+        designed: Controller = VoltageOutput(kind.design(plant.torque_plant, period, {**p, **limit}), plant)
+    else:
+        designed = kind.design(plant, period, p)
     if checked:
         designed.check(period)
     controller: Controller = designed

@@ -1,4 +1,4 @@
-"""Interface of all controllers: states of n joints in, efforts of the m driven ones out."""
+"""Interface of all controllers: states of n joints in, commands of the m driven ones out: efforts, or volts."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Controller:
     """Maps states to efforts. A subclass defines ``efforts``, or for one joint alone ``command``.
 
     Attributes:
-        effort_limits: Largest effort of each driven joint [N m or N].
+        effort_limits: Largest command of each driven joint [N m or N, or V].
         feedback: Gain near the set-point; None for a law without one.
         inner: Wrapped controller, or None.
     """
@@ -38,6 +38,8 @@ class Controller:
     """Whether it applies ``start_time`` itself; for others a wrapper does."""
     FEEDBACK: ClassVar[bool] = True
     """Whether it closes a loop whose linear model must be stable."""
+    IN_VOLTS: ClassVar[bool] = False
+    """Whether its commands to motors are volts; others get the plant behind its motors, and are converted."""
     TIME_INVARIANT: ClassVar[bool] = True
     """Whether commands do not depend on time, so that the loop has a frequency response."""
 

@@ -47,7 +47,7 @@ class JointEnergySwingUp(Controller):
         """Return gains, with the mechanism's defaults, and LQR parameters; DesignError if not supported."""
         gains = pump_gains(plant)
         joint = _driven(plant)
-        q, r = plant.mechanism.weights
+        q, r = plant.weights
         return (
             ParameterSpec("gain", gains.gain, "-", "Pumping per energy error and velocity, without units.", minimum=0.0,
                           exclusive_minimum=True),

@@ -45,6 +45,6 @@ class JointIlqr(JointSwingUp):
 
     def _find(self, plant: PlantParameters, p: Mapping[str, Any]) -> tuple[MechanismCatch, MechanismTrajectory]:
         refuse_passive_friction("ilqr", plant)
-        catch = make_mechanism_catch(plant, *plant.mechanism.weights, joint_limits(plant, p["effort_limit"]))
+        catch = make_mechanism_catch(plant, *plant.weights, joint_limits(plant, p["effort_limit"]))
         search = SwingUpSearch(_WEIGHTS, duration=p["duration"])
         return catch, cheapest_swing_up(catch, search, range(p["guesses"]))[0]

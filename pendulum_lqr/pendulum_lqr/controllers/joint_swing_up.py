@@ -71,7 +71,7 @@ class JointSwingUp(CaughtController):
     def __init__(self, plant: PlantParameters, period: float, p: Mapping[str, Any]) -> None:
         catch, trajectory = self._find(plant, p)
         self._duration = trajectory.duration
-        q, r = plant.mechanism.weights
+        q, r = plant.weights
         super().__init__(MechanismTvlqr(period, trajectory, catch, q=q, r=r), period)
 
     @classmethod

@@ -37,8 +37,8 @@ _SMALLER_Q = "a faster plant, or a smaller q"
 
 
 def joint_limits(plant: PlantParameters, limit: float) -> Vector:
-    """Return the smaller of each driven joint's own limit and the controller's (0 for none) [N m or N]."""
-    return tuple(min(limit or math.inf, own) for own in plant.effort_limits)
+    """Return the smaller of each driven joint's own limit and the controller's (0 for none) [N m or N, or V]."""
+    return tuple(min(limit or math.inf, own) for own in plant.command_limits)
 
 
 def require_catching(controller: str, catch: MechanismCatch, period: float) -> None:
@@ -59,11 +59,12 @@ class LinearFeedback(LawController):
     Attributes:
         gain: Gain, designed by a subclass.
         model: Linear model at the fixed point.
-        hold: The m efforts that are fed forward [N m or N].
+        hold: The m commands that are fed forward [N m or N, or V].
         position: Fixed point, n values [rad or m].
     """
 
     BALANCES = True
+    IN_VOLTS = True
     SETTLES_BY: ClassVar[str] = ""
     """Action at every state, in refusals of another period; empty if only the gain must settle."""
 
@@ -92,16 +93,16 @@ class LinearFeedback(LawController):
         """Return weights, with the plant's defaults, own parameters, feed-forward, set-point and limit."""
         if plant is None or plant.is_pendulum:
             return (Q, R, *cls.own(plant), FEEDFORWARD)
-        q, r = plant.mechanism.weights
-        names = ", ".join(plant.coordinates.names)
+        q, r = plant.weights
+        names, what = ", ".join(plant.coordinates.names), "voltage" if plant.coordinates.volts else "effort"
         rest, diagonal = [0.0] * len(plant.joints), f"Diagonal of Q: weights of {names}, then of their velocities."
         return (
             ParameterSpec("q", list(q), "", diagonal, minimum=0.0),
-            ParameterSpec("r", r, "", "Weight of each effort, R.", minimum=0.0, exclusive_minimum=True),
+            ParameterSpec("r", r, "", f"Weight of each {what}, R.", minimum=0.0, exclusive_minimum=True),
             *cls.own(plant),
             replace(FEEDFORWARD, description="Whether the efforts that hold the set-point against gravity are added."),
             ParameterSpec("set_point", rest, "", f"Place to hold, from upright: {plant.coordinates.with_units}."),
-            JOINT_LIMIT,
+            replace(JOINT_LIMIT, unit="V") if plant.coordinates.volts else JOINT_LIMIT,
         )
 
     def check(self, period: float) -> None:
@@ -124,7 +125,7 @@ class LinearFeedback(LawController):
         return self.feedback
 
     def efforts(self, t: float, position: Vector, velocity: Vector) -> Vector:
-        """Return m efforts [N m or N]."""
+        """Return m commands [N m or N, or V]."""
         if self._direct is not None:  # as in LawController, without a call more
             return (self._direct(t, wrap_angle(position[0] - UPRIGHT), velocity[0], self.memory, self.numbers),)
         if self.law is not None:

@@ -51,9 +51,10 @@ class LinearMpc(SampledFeedback):
         self.failures = 0
         for name, hold, limit in zip(plant.coordinates.driven_names, self.hold, self.effort_limits, strict=True):
             if abs(hold) >= limit:
+                unit = plant.coordinates.drive_unit
                 raise DesignError(
-                    f"holding set_point {p['set_point']} takes {hold:.4g} N m at {name}; expected less than "
-                    f"effort_limit = {limit:g} N m"
+                    f"holding set_point {p['set_point']} takes {hold:.4g} {unit} at {name}; expected less than "
+                    f"effort_limit = {limit:g} {unit}"
                 )
         one = "position_limits" not in p
         widths = [p["angle_limit"], p["velocity_limit"]] if one else p["position_limits"]

@@ -101,7 +101,7 @@ class LearnedPolicy(Controller):
         limits = tuple(min(both) for both in zip(own, policy.effort_limit, strict=True))
         catch = None
         if not plant.is_pendulum and p["catch"] != ZERO:
-            catch = make_mechanism_catch(plant, *plant.mechanism.weights, limits)
+            catch = make_mechanism_catch(plant, *plant.weights, limits)
         hold = states_to_hold(policy, period)
         return cls(policy, hold, limits, fallback, start_time=p["start_time"], catch=catch, plant=plant)
 

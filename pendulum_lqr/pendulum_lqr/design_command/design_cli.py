@@ -124,7 +124,7 @@ def design(
     if parameters.is_pendulum:
         limit = _limit(effort_limit, parameters.effort_limit)
     else:
-        own = (parameters.mechanism.weights,)
+        own = (parameters.weights,)
         if any((theta != UPRIGHT, effort_limit, tracking)):
             raise ParameterError(
                 f"plant {chosen_plant!r} has several joints; expected --theta, --effort-limit and --tracking left out: "
@@ -204,6 +204,7 @@ class _Table:
             "plant": self.plant.name,
             "joints": list(self.plant.coordinates.names),
             "driven": list(self.plant.coordinates.driven_names),
+            "command_unit": self.plant.coordinates.drive_unit,
             "theta": model.theta,
             "effort": model.effort,
             "position": list(model.position),
@@ -265,7 +266,7 @@ class _Table:
             for state, value, joint in zip(model.states, model.position, joints, strict=False)
         )
         held = ", ".join(
-            f"{value:.4g} {joints[index].effort_unit}"
+            f"{value:.4g} {'V' if self.plant.coordinates.volts else joints[index].effort_unit}"
             for index, value in zip(self.plant.coordinates.driven, model.efforts, strict=True)
         )
         what = f"states {', '.join(model.states)};"
@@ -273,6 +274,9 @@ class _Table:
             a, b = model.A[1], model.B[1, 0]
             what = f"A = [[0, 1], [{a[0]:.2f}, {a[1]:.2f}]], B = [0, {b:.2f}],"
         lines = [f"plant {self.plant.name} at {at}: {what} u* = {held}", *hidden_and_late(model)]
+        for name, motor in zip(self.plant.coordinates.driven_names, self.plant.actuators, strict=True):
+            if (of := motor.motor) is not None:
+                lines.append(f"K in volts: the motor of {name} gives {of.gain:.4g} per volt, damps by {of.damping:.4g}")
         if not self.plant.is_pendulum and self.plant.has_dry_friction:
             lines.append(
                 "dry friction has no derivative at rest and is not in the model: simulate the loop to see its cost"

@@ -50,6 +50,8 @@ NODE_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("joints", [""], "",
         "Joints to disturb, in the plant's order, each by its own signal with the next seed. "
         "Empty for the joint of a pendulum.", read_only=True),
+    ParameterSpec("volts", False, "",
+        "The signal is a voltage, on `voltage_disturbance`, for a plant driven in volts.", read_only=True),
     LOCKSTEP_SUBSCRIBERS,
     COMPILED,
     REALTIME_PRIORITY,
@@ -83,7 +85,8 @@ class DisturbanceNode(PollingNode):
         ]
         self._loop = self._loops[0]
         self._logged_others = False
-        self._torque_publisher = self.create_publisher(JointState, names.DISTURBANCE, qos.COMMAND)
+        topics = names.VOLTAGE_TOPICS if self._settings["volts"] else names.EFFORT_TOPICS
+        self._torque_publisher = self.create_publisher(JointState, topics.disturbance, qos.COMMAND)
         self._first_answer = FirstAnswer(self, self._torque_publisher, self._settings["lockstep_subscribers"])
         self._event_publisher = self.create_publisher(String, names.EVENTS, qos.EVENTS)
         self._diagnostics = Diagnostics(self, "disturbance")

@@ -4,8 +4,10 @@ Derivatives of the simulator's equations by complex step, exact to rounding. For
 
     x = [q - q*, v],   x' = A x + B du,   A = [[0, I], [d v'/dq, d v'/dv]],   B = [0; d v'/d torque at driven joints]
 
-An actuator lag T adds the state tau' = (u - tau) / T; transport delay is a number of the model. Dry friction, end stops
-and spring hysteresis have no derivative at rest and are neglected: simulate the nonlinear loop to see their effect.
+An actuator lag T adds the state tau' = (u - tau) / T; transport delay is a number of the model. The command u of a
+motor is a voltage: its torque is ``gain u``, and its back EMF is part of the damping. Dry friction, end stops, dead
+bands and spring hysteresis have no derivative at rest and are neglected: simulate the nonlinear loop to see their
+effect.
 """
 
 from __future__ import annotations
@@ -69,7 +71,7 @@ class LinearModel:
 
     Attributes:
         A: State matrix, shape (n, n) [1/s and mixed].
-        B: Input matrix of the commanded efforts, shape (n, m) [state/(N m s)].
+        B: Input matrix of the commands, shape (n, m) [state/(N m s), of motors state/(V s)].
         theta: Angle of the fixed point, 0 hanging down [rad]; of several joints the last position.
         effort: Commanded torque that holds the fixed point [N m]; of several driven joints the first.
         C: Output matrix, shape (k, n).
@@ -79,7 +81,7 @@ class LinearModel:
             series-elastic plant, then torque, the lagged command. Of a mechanism the joints, their velocities
             (``JOINT_dot``), then the lagged efforts (``JOINT_effort``).
         position: Fixed point, one value for each joint [rad or m].
-        efforts: The m efforts that hold it [N m or N].
+        efforts: The m commands that hold it [N m or N, or V].
     """
 
     A: Matrix
@@ -135,7 +137,8 @@ class _Body(NamedTuple):
 
     Attributes:
         rates: Derivatives of the states, from states, m actuator efforts and a torque on each joint.
-        efforts: The m efforts that hold the fixed point.
+        efforts: The m commands that hold the fixed point.
+        gains: Effort of each actuator per command, without lag.
         lags: Lag of each actuator [s].
         lag_states: Name of the state of each lag.
         measured: Number of measured (leading) states.
@@ -146,6 +149,7 @@ class _Body(NamedTuple):
     at: tuple[float, ...]
     rates: Callable[[tuple[complex, ...], Sequence[complex], Sequence[complex]], tuple[complex, ...]]
     efforts: Vector
+    gains: Vector
     lags: Vector
     lag_states: tuple[str, ...]
     measured: int
@@ -185,14 +189,15 @@ def linearise(plant: RigidPlant | PlantParameters, at: float | Sequence[float] |
     n = size + len(lagging)
 
     def flow(*values: complex) -> tuple[complex, ...]:
-        x, command, push = values[:n], values[n : n + m], values[n + m :]
+        x, push = values[:n], values[n + m :]
+        command = [gain * value for gain, value in zip(body.gains, values[n : n + m], strict=True)]
         torque = list(command)
         for index, lagged in zip(lagging, x[size:], strict=True):
             torque[index] = lagged
         follow = ((command[index] - torque[index]) / body.lags[index] for index in lagging)
         return (*body.rates(x[:size], torque, push), *follow)
 
-    held = (body.efforts[index] for index in lagging)
+    held = (body.gains[index] * body.efforts[index] for index in lagging)
     jacobian = np.array(complex_step(flow, (*body.at, *held, *body.efforts, *(0.0,) * body.joints)))
     return LinearModel(
         jacobian[:, :n].copy(),
@@ -209,7 +214,7 @@ def linearise(plant: RigidPlant | PlantParameters, at: float | Sequence[float] |
 
 
 def holding_effort(plant: PlantParameters, position: Sequence[float] | None = None) -> Vector:
-    """Return the m efforts that hold a mechanism at n positions [rad or m], None for upright [N m or N].
+    """Return the m commands that hold a mechanism at n positions [rad or m], None for upright [N m or N, or V].
 
     Raises:
         ParameterError: The position has another length, is not finite, or a passive joint would fall from it.
@@ -231,7 +236,10 @@ def holding_effort(plant: PlantParameters, position: Sequence[float] | None = No
                 f"{joint.effort_unit}; expected a position at which gravity leaves it alone, such as "
                 f"{', '.join(f'{value:.6g}' for value in plant.coordinates.goal)}"
             )
-    return tuple(float(weight[index]) if abs(weight[index]) > _BALANCED * scale else 0.0 for index in driven)
+    return tuple(
+        float(weight[index]) / gain if abs(weight[index]) > _BALANCED * scale else 0.0
+        for index, gain in zip(driven, plant.gains, strict=True)
+    )
 
 
 def low_frequency(model: LinearModel) -> tuple[float, float, float]:
@@ -344,7 +352,7 @@ def _pendulum_body(plant: RigidPlant, theta: float) -> _Body:
 
     efforts = (equilibrium_effort(plant, theta),)
     lags = (offset_of(plant, "actuator_time_constant"),)
-    return _Body(states, at, rates, efforts, lags, ("torque",), 2, 1, offset_of(plant, "transport_delay"))
+    return _Body(states, at, rates, efforts, (1.0,), lags, ("torque",), 2, 1, offset_of(plant, "transport_delay"))
 
 
 def _mechanism_body(plant: PlantParameters, q: Vector) -> _Body:
@@ -365,6 +373,7 @@ def _mechanism_body(plant: PlantParameters, q: Vector) -> _Body:
         (*q, *(0.0,) * n),
         rates,
         holding_effort(plant, q),
+        plant.gains,
         tuple(actuator.time_constant for actuator in actuators),
         tuple(f"{name}_effort" for name in coordinates.driven_names),
         2 * n,

@@ -34,7 +34,7 @@ from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.contract.plant_specs import COMPILED, REALTIME_PRIORITY
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.contract.values import JointSample, Vector
-from pendulum_msgs_py.errors import PendulumError
+from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS, PRESET_NAMES, load_mechanism
 from pendulum_msgs_py.programs.realtime import as_ordinary
@@ -128,10 +128,15 @@ class ControllerNode(LifecycleNode, PollingNode):
         self._full_name = self.get_fully_qualified_name()
         self._logged_refusals = 0
         self._multi_array = self._settings["command_type"] == "multi_array"
+        if self._multi_array and self._coordinates.volts:
+            raise ParameterError(
+                f"command_type is 'multi_array', of efforts, and plant {self._plant.name!r} is driven in volts; "
+                "expected 'joint_state'"
+            )
         if self._multi_array:
             self._command_publisher = self.create_publisher(Float64MultiArray, _MULTI_ARRAY_TOPIC, qos.COMMAND)
         else:
-            self._command_publisher = self.create_publisher(JointState, names.EFFORT_COMMAND, qos.COMMAND)
+            self._command_publisher = self.create_publisher(JointState, self._coordinates.topics.command, qos.COMMAND)
         self._first_answer = FirstAnswer(self, self._command_publisher, self._settings["lockstep_subscribers"])
         self._diagnostics = Diagnostics(self, "controller")
         source = self.create_waited_input(JointState, names.JOINT_STATES, qos.NEWEST_STATE, self._on_state)

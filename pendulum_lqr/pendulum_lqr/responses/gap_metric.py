@@ -134,7 +134,7 @@ class JointScaling(SignalScaling):
         """Return the scaling of a plant's own LQR weights; ``names`` are those of its positions and velocities."""
         joints = plant.coordinates.joints
         units = [joint.unit for joint in joints] + [joint.velocity_unit for joint in joints]
-        return cls.of_weights(names, units, *plant.mechanism.weights, plant.coordinates.drive_unit)
+        return cls.of_weights(names, units, *plant.weights, plant.coordinates.drive_unit)
 
     @property
     def outputs(self) -> Array:

@@ -74,5 +74,5 @@ class PlannedSwingUp(Controller):
 
     def _follow(self, plan: IlqrPlan) -> MechanismTvlqr:
         trajectory = trajectory_of(self.plant, plan, self.search.settings.step)
-        q, r = self.plant.mechanism.weights
+        q, r = self.plant.weights
         return MechanismTvlqr(self.period, trajectory, self.catch, q=q, r=r, tube=_TUBE)

@@ -32,7 +32,7 @@ def stored_trajectory(plant: PlantParameters) -> MechanismTrajectory:
 
 def default_catch(plant: PlantParameters) -> MechanismCatch:
     """Return the LQR that catches, with its sampled region."""
-    return make_mechanism_catch(plant, *plant.mechanism.weights)
+    return make_mechanism_catch(plant, *plant.weights)
 
 
 def refuse_passive_friction(controller: str, plant: PlantParameters) -> None:

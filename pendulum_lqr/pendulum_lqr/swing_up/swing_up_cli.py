@@ -59,7 +59,7 @@ def swing_up(
         ) from error
     with writing(f"trajectory {output}", ParameterError):
         output.parent.mkdir(parents=True, exist_ok=True)
-    catch = default_catch(plant)
+    catch = default_catch(plant.torque_plant)
     search = SwingUpSearch(values, duration=duration)
     console = make_console(highlight=False)
     with counting_bar(console) as bar:

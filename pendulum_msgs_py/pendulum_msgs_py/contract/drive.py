@@ -51,10 +51,10 @@ class Drive(NamedTuple):
 
     Attributes:
         kind: Off (zero effort, drive released), effort, or position control.
-        effort: m efforts; under position control the feed-forward of the handover [N m or N].
+        effort: m commands; under position control the feed-forward of the handover [N m or N, or V].
         position: m set points [rad or m], for ``POSITION``.
         velocity: Their velocities.
-        controller: The controller's share of the efforts, before limits.
+        controller: The controller's share of the commands, before limits.
         disturbance: The disturbance's share.
         push: n efforts on the joints themselves, applied in every mode.
         saturated: A sum was clamped.
@@ -79,7 +79,7 @@ class PlantLimits:
     """Limits that a plant enforces; a scalar holds for each joint, in its own unit.
 
     Attributes:
-        effort: Largest effort of each driven joint, after the sum of controller and disturbance [N m or N].
+        effort: Largest command of each driven joint, after the sum of controller and disturbance [N m or N, or V].
         command_timeout: Age at which a command is ignored [s].
         feedback_timeout: Age of the measurement at which an armed plant faults [s].
         velocity: Speed at which an armed plant faults, and largest of a trajectory [rad/s].
@@ -96,6 +96,7 @@ class PlantLimits:
         stop_time: Time over which torque fades at e-stop and disarm, stop category 1; 0 for category 0 [s].
         starvation: Time without a command after which a plant armed for effort disarms [s].
         enable_timeout: Silence of the hold-to-run switch that disarms; infinity for no switch [s].
+        push: Effort of each driven joint that scales its largest push [N m or N]; empty for ``effort``.
         coordinates: Joints that give the messages their units.
     """
 
@@ -116,6 +117,7 @@ class PlantLimits:
     starvation: float = math.inf
     stop_time: float = 0.0
     enable_timeout: float = math.inf
+    push: Vector = ()
     coordinates: Coordinates = field(default=ONE_JOINT, compare=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -124,6 +126,8 @@ class PlantLimits:
         for effort in self.effort:
             if not (math.isfinite(effort) and effort > 0.0):
                 raise ParameterError(f"effort_limit is {effort} {of_effort}; expected a finite number > 0")
+        if not all(math.isfinite(effort) and effort > 0.0 for effort in self.push):
+            raise ParameterError(f"push is {self.push}; expected finite numbers > 0")
         if not (math.isfinite(self.command_timeout) and self.command_timeout > 0.0):
             raise ParameterError(f"command_timeout is {self.command_timeout} s; expected a finite number > 0")
         for name, unit in (

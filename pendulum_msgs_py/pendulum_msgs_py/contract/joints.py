@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
-from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.contract.names import EFFORT_TOPICS, JOINT, VOLTAGE_TOPICS, DriveTopics
 from pendulum_msgs_py.contract.values import Vector
 from pendulum_msgs_py.errors import ParameterError
 
@@ -46,6 +46,11 @@ class Joint:
         return "N m" if self.unit == "rad" else "N"
 
     @property
+    def gear_unit(self) -> str:
+        """Unit of a motor's turns per motion of the joint."""
+        return "-" if self.unit == "rad" else "rad/m"
+
+    @property
     def damping_unit(self) -> str:
         """Unit of viscous friction."""
         return "N m s/rad" if self.unit == "rad" else "N s/m"
@@ -58,10 +63,12 @@ class Coordinates:
     Attributes:
         joints: All n joints.
         driven: Indices of the m joints with an actuator, ascending.
+        volts: Whether their commands are voltages of motors, on topics of their own; else efforts.
     """
 
     joints: tuple[Joint, ...]
     driven: tuple[int, ...]
+    volts: bool = False
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,24 +82,31 @@ class Coordinates:
 
     @property
     def driven_names(self) -> tuple[str, ...]:
-        """Names of the driven joints, as in ``effort_command``."""
+        """Names of the driven joints, as in commands."""
         return tuple(self.joints[index].name for index in self.driven)
 
     @property
     def units(self) -> tuple[str, str, str]:
-        """Units of position, velocity and effort, for messages; ``rad or m`` where joints differ."""
+        """Units of position, velocity and joint effort, for messages; ``rad or m`` where joints differ."""
         every = zip(*((joint.unit, joint.velocity_unit, joint.effort_unit) for joint in self.joints), strict=True)
         position, velocity, effort = (" or ".join(dict.fromkeys(units)) for units in every)
         return position, velocity, effort
 
     @property
     def drive_unit(self) -> str:
-        """Unit of the actuators' efforts, for messages."""
-        return " or ".join(dict.fromkeys(self.joints[index].effort_unit for index in self.driven))
+        """Unit of the actuators' commands, for messages."""
+        return (
+            "V" if self.volts else " or ".join(dict.fromkeys(self.joints[index].effort_unit for index in self.driven))
+        )
+
+    @property
+    def topics(self) -> DriveTopics:
+        """Topics of commands in this unit."""
+        return VOLTAGE_TOPICS if self.volts else EFFORT_TOPICS
 
     @property
     def slew_unit(self) -> str:
-        """Unit of the rate of these efforts, for messages."""
+        """Unit of the rate of these commands, for messages."""
         return " or ".join(f"{unit}/s" for unit in self.drive_unit.split(" or "))
 
     @property

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from typing import NamedTuple
+
 __all__ = [
     "APPLIED_EFFORT",
+    "APPLIED_VOLTAGE",
     "ARM",
     "CLOCK",
     "DIAGNOSTICS",
     "DISTURBANCE",
     "EFFORT_COMMAND",
+    "EFFORT_TOPICS",
     "ENABLE_INPUT",
     "EVENTS",
     "E_STOP",
@@ -21,7 +26,12 @@ __all__ = [
     "PUSH",
     "RECORDER",
     "SIGNALS",
+    "VOLTAGE_COMMAND",
+    "VOLTAGE_DISTURBANCE",
+    "VOLTAGE_TOPICS",
+    "DriveTopics",
     "Event",
+    "drive_topics",
     "full_name",
 ]
 
@@ -38,8 +48,23 @@ DISTURBANCE = "disturbance"
 JOINT_TRAJECTORY = "joint_trajectory"
 PUSH = "push"
 APPLIED_EFFORT = "applied_effort"
+VOLTAGE_COMMAND = "voltage_command"
+VOLTAGE_DISTURBANCE = "voltage_disturbance"
+APPLIED_VOLTAGE = "applied_voltage"
 SIGNALS = (JOINT_STATES, EFFORT_COMMAND, DISTURBANCE, APPLIED_EFFORT)
 """The signals of the control loop, in order; a recording needs all of them."""
+
+
+class DriveTopics(NamedTuple):
+    """Topics that carry a plant's commands in its own unit, so that no volt is read as a newton metre."""
+
+    command: str
+    disturbance: str
+    applied: str
+
+
+EFFORT_TOPICS = DriveTopics(EFFORT_COMMAND, DISTURBANCE, APPLIED_EFFORT)
+VOLTAGE_TOPICS = DriveTopics(VOLTAGE_COMMAND, VOLTAGE_DISTURBANCE, APPLIED_VOLTAGE)
 EVENTS = "events"
 E_STOP_INPUT = "e_stop_input"
 """``std_msgs/Bool``, published continuously: true is pressed."""
@@ -54,6 +79,13 @@ CLOCK = "/clock"
 ARM = "~/arm"
 E_STOP = "~/e_stop"
 E_STOP_RESET = "~/e_stop_reset"
+
+
+def drive_topics(recorded: Collection[str], space: str) -> DriveTopics:
+    """Return the topics of commands of a plant in a namespace, by those that were recorded."""
+    efforts, volts = ([f"{space}/{name}" in recorded for name in topics] for topics in (EFFORT_TOPICS, VOLTAGE_TOPICS))
+    # A command alone may be one that its plant did not receive.
+    return VOLTAGE_TOPICS if volts[2] or (volts[0] and not efforts[0] and not efforts[2]) else EFFORT_TOPICS
 
 
 def full_name(namespace: str, node: str) -> str:

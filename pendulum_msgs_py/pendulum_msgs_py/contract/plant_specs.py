@@ -138,8 +138,9 @@ def in_units_of(specs: Iterable[ParameterSpec], coordinates: Coordinates) -> tup
 
 def limits_from_parameters(
     values: Mapping[str, object],
-    plant_effort_limits: Vector,
+    plant_limits: Vector,
     *,
+    push: Vector = (),
     coordinates: Coordinates = ONE_JOINT,
     lockstep: bool,
     feedback_timeout: float = float("inf"),
@@ -149,7 +150,8 @@ def limits_from_parameters(
 
     Args:
         values: Parameter values by name.
-        plant_effort_limits: Of the driven joints, in the plant file [N m or N]; parameters only lower them.
+        plant_limits: Of the driven joints' commands, in the plant file [N m or N, or V]; parameters only lower them.
+        push: As in the limits.
         coordinates: Joints of the plant.
         lockstep: Simulated time, in which noise starts with the controller: their sum is not limited.
         feedback_timeout: Age of a measurement that faults an armed plant [s].
@@ -170,7 +172,7 @@ def limits_from_parameters(
     if len(window) != 2 * joints and window != [0.0, 0.0]:
         expected = "[low, high] in rad" if joints == 1 else f"{2 * joints}, low and high of each joint"
         raise ParameterError(f"position_window has {len(window)} values; expected {expected}")
-    largest = max(plant_effort_limits, default=0.0)
+    largest = max(plant_limits, default=0.0)
     wanted = number("effort_limit")
     if wanted > largest:
         raise ParameterError(
@@ -187,7 +189,7 @@ def limits_from_parameters(
         )
     start, handover = number("start_effort_limit") or unlimited, number("handover_effort_limit")
     return PlantLimits(
-        effort=tuple(min(wanted, limit) if wanted else limit for limit in plant_effort_limits),
+        effort=tuple(min(wanted, limit) if wanted else limit for limit in plant_limits),
         command_timeout=max(number("command_timeout"), least_command_timeout),
         feedback_timeout=feedback_timeout,
         velocity=number("velocity_limit") or unlimited,
@@ -203,5 +205,6 @@ def limits_from_parameters(
         starvation=number("starvation_limit") or unlimited,
         stop_time=number("stop_time"),
         enable_timeout=number("enable_timeout") or unlimited,
+        push=push,
         coordinates=coordinates,
     )

@@ -27,7 +27,7 @@ from pendulum_msgs_py.contract.values import NANOSECONDS, JointCommand, JointSam
 __all__ = ["PUSH_LIMIT_FACTOR", "Drive", "DriveKind", "Input", "Mode", "PlantLimits", "PlantSupervisor"]
 
 PUSH_LIMIT_FACTOR = 10.0
-"""A push is clamped to this multiple of the effort limit: 1e308 N m is finite too."""
+"""A push is clamped to this multiple of the actuator's effort: 1e308 N m is finite too."""
 
 _KEPT_TRANSITIONS = 50
 _LONGEST_STEP_NS = NANOSECONDS // 10
@@ -67,8 +67,9 @@ class PlantSupervisor:
         self._nothing = (0.0,) * len(driven)
         self._no_push = (0.0,) * len(joints)
         # A passive joint has the push limit of the strongest motor.
-        largest = max(self.limits.effort, default=1.0)
-        own = dict(zip(driven, self.limits.effort, strict=True))
+        efforts = self.limits.push or self.limits.effort
+        largest = max(efforts, default=1.0)
+        own = dict(zip(driven, efforts, strict=True))
         self._push_limits = tuple(PUSH_LIMIT_FACTOR * own.get(name, largest) for name in joints)
         # Attributes, because enum hashes its members in Python: slow in each decision.
         self._commands = self.gates[Input.EFFORT_COMMAND]
@@ -109,7 +110,7 @@ class PlantSupervisor:
         """Follow a trajectory; return why it is refused, or an empty string."""
         limits = self.limits
         if not self.follows:
-            return f"{self.no_trajectories}; expected effort_command"
+            return f"{self.no_trajectories}; expected {self.coordinates.topics.command}"
         if not self.mode.armed:
             return f"plant is {self.mode.value}; expected it armed before a trajectory"
         fault = self._measurement_fault(now_ns, sample)

@@ -17,9 +17,11 @@ __all__ = [
     "OF_A_PENDULUM",
     "Actuator",
     "JointParameters",
+    "Motor",
     "SeriesElasticParameters",
     "actuator_specs",
     "joint_specs",
+    "motor_specs",
 ]
 
 
@@ -89,8 +91,53 @@ DRIVETRAIN_SPECS = specs_of(SeriesElasticParameters)
 
 
 @dataclass(frozen=True)
+class Motor:
+    """A DC motor with gears that is commanded by its voltage u; the current settles at once.
+
+    ::
+
+        effort = N k_t (u - N k_e v) / R = gain u - damping v,   gain = N k_t / R,   damping = N^2 k_t k_e / R
+
+    With an inductance L the effort of u lags by L/R. The back EMF does not, which is the same to first order as long as
+    damping L/R, an inertia, is small beside the joint's; a plant where it is not is refused.
+    """
+
+    resistance: Annotated[float, Quantity("ohm", "Winding resistance, with that of the amplifier, R.", positive=True)]
+    torque_constant: Annotated[float, Quantity("N m/A", "Motor torque per current, k_t.", positive=True)]
+    voltage_limit: Annotated[
+        float, Quantity("V", "Largest voltage of the amplifier.", positive=True, example=10.0, largest=_LARGEST_EFFORT)
+    ]
+    back_emf_constant: Annotated[
+        float | None, Quantity("V s/rad", "Voltage per motor speed, k_e; by default the torque constant's value.")
+    ] = None
+    gear_ratio: Annotated[float, Quantity("gear_unit", "Motor turns per motion of the joint, N.", positive=True)] = 1.0
+    inductance: Annotated[float, Quantity("H", "Winding inductance, L; 0 for none.")] = 0.0
+    dead_band: Annotated[float, Quantity("V", "Voltage at standstill that gives no torque; 0 for none.")] = 0.0
+
+    @property
+    def gain(self) -> float:
+        """Effort per volt at standstill [N m/V or N/V]."""
+        return self.gear_ratio * self.torque_constant / self.resistance
+
+    @property
+    def damping(self) -> float:
+        """Effort of the back EMF per velocity [N m s/rad or N s/m]."""
+        constant = self.torque_constant if self.back_emf_constant is None else self.back_emf_constant
+        return self.gain * self.gear_ratio * constant
+
+    def stall_effort(self, voltage: float) -> float:
+        """Return the effort of a voltage [V] at standstill, beyond the dead band [N m or N]."""
+        band = self.dead_band
+        return self.gain * (voltage - min(band, max(-band, voltage)) if band > 0.0 else voltage)
+
+
+@dataclass(frozen=True)
 class Actuator:
-    """The motor of one joint; ``effort_unit`` is the joint's."""
+    """The actuator of one joint; ``effort_unit`` is the joint's.
+
+    With a ``motor`` its commands are volts; the effort limit is then the motor's at standstill, and an inductance
+    determines the time constant.
+    """
 
     effort_limit: Annotated[
         float,
@@ -98,6 +145,19 @@ class Actuator:
     ]
     time_constant: Annotated[float, Quantity("s", "First-order lag between command and effort; 0 for none.")] = 0.0
     transport_delay: Annotated[float, Quantity("s", "Time between a command and its first effect.")] = 0.0
+    motor: Motor | None = None
+
+    def __post_init__(self) -> None:
+        motor = self.motor
+        if motor is not None and motor.resistance > 0.0:
+            object.__setattr__(self, "effort_limit", abs(motor.stall_effort(motor.voltage_limit)))
+            if motor.inductance > 0.0:
+                object.__setattr__(self, "time_constant", motor.inductance / motor.resistance)
+
+    @property
+    def command_limit(self) -> float:
+        """Largest command, in volts with a motor, else an effort."""
+        return self.effort_limit if self.motor is None else self.motor.voltage_limit
 
 
 if TYPE_CHECKING:
@@ -140,6 +200,12 @@ class JointParameters(_FrictionTerms):
         """Dry friction at which sliding starts [N m or N]."""
         return self.coulomb_friction if self.static_friction is None else self.static_friction
 
+    @property
+    def total_damping(self) -> float:
+        """Viscous friction and, of a motor in volts, back EMF [N m s/rad or N s/m]."""
+        motor = None if self.actuator is None else self.actuator.motor
+        return self.damping if motor is None else self.damping + motor.damping
+
 
 @cache
 def joint_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
@@ -151,6 +217,12 @@ def joint_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
 def actuator_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
     """Return the table of its actuator's quantities in its units."""
     return _in_units_of(joint, Actuator)
+
+
+@cache
+def motor_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
+    """Return the table of its motor's quantities in its units."""
+    return _in_units_of(joint, Motor)
 
 
 def _in_units_of(joint: Joint, kind: type) -> tuple[ParameterSpec, ...]:

@@ -15,6 +15,7 @@ from pendulum_msgs_py.plants.joint_parameters import (
     OF_A_PENDULUM,
     Actuator,
     JointParameters,
+    Motor,
     SeriesElasticParameters,
 )
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant
@@ -132,7 +133,10 @@ def _from_mapping(entry: Any) -> PlantParameters:
     joints = []
     for joint in entry["joints"]:
         drive = joint.get("actuator")
-        joints.append(JointParameters(**{**joint, "actuator": None if drive is None else Actuator(**drive)}))
+        if drive is not None:
+            motor = drive.get("motor")
+            drive = Actuator(**{**drive, "motor": None if motor is None else Motor(**motor)})
+        joints.append(JointParameters(**{**joint, "actuator": drive}))
     return PlantParameters(MECHANISMS[entry["model"]], tuple(entry["values"]), tuple(joints), name)
 
 

@@ -14,7 +14,8 @@ those with an ``actuator:`` are driven::
         coulomb_friction: {value: 0.12, unit: N m}
         actuator: {effort_limit: {value: 6.0, unit: N m}}
 
-``pendulum_plant/1`` lists the numbers of one driven hinge::
+An actuator with ``motor:`` (resistance, torque_constant, voltage_limit, ...) in place of ``effort_limit`` is commanded
+in volts. ``pendulum_plant/1`` lists the numbers of one driven hinge::
 
     format: pendulum_plant/1
     name: thesis
@@ -58,9 +59,11 @@ from pendulum_msgs_py.plants.joint_parameters import (
     OF_A_PENDULUM,
     Actuator,
     JointParameters,
+    Motor,
     SeriesElasticParameters,
     actuator_specs,
     joint_specs,
+    motor_specs,
 )
 from pendulum_msgs_py.plants.quantities import (
     build_plant,
@@ -120,10 +123,12 @@ _EXAMPLES = {"damping": 11.77, "effort_limit": 13.0}
 """Defaults of a single joint where they differ; a foreign simulation's effort may be of any size."""
 _ANGLES = 16
 """Angles of each turning joint at which the mass matrix is checked."""
+_LATE = 0.05
+"""Share of a joint's inertia by which its motor's inductance may be felt, beyond a lag."""
 
 
 class _Place(NamedTuple):
-    """A number of a plant: in ``values``, or in a ``joint`` or its ``actuator`` (the part), by index and field."""
+    """A number of a plant: in ``values``, a ``joint``, its ``actuator`` or ``motor`` (the part), by index and field."""
 
     spec: ParameterSpec
     part: str
@@ -141,11 +146,12 @@ def _places(mechanism: Mechanism) -> dict[str, _Place]:
         for part, specs in (
             ("joint", joint_specs(joint) if mechanism.name == _PENDULUM.name else _format_2(joint)),
             ("actuator", actuator_specs(joint)),
+            ("motor", motor_specs(joint)),
         ):
             for spec in specs:
                 name, shown, where = _name(mechanism, joint, spec.name), spec, ""
                 if several:
-                    where = joint.name if part == "joint" else f"{joint.name}.actuator"
+                    where = {"joint": joint.name, "actuator": f"{joint.name}.actuator"}.get(part, f"{joint.name}.motor")
                 else:
                     shown = replace(spec, name=name, default=_EXAMPLES.get(name, spec.default), maximum=None)
                 found[name] = _Place(shown, part, index, spec.name, where)
@@ -167,7 +173,9 @@ def _format_2(joint: Joint) -> tuple[ParameterSpec, ...]:
 
 
 PLANT_SPECS = tuple(
-    place.spec for name, place in _places(_PENDULUM).items() if name not in {"lower_stop", "upper_stop"}
+    place.spec
+    for name, place in _places(_PENDULUM).items()
+    if name not in {"lower_stop", "upper_stop"} and place.part != "motor"
 )
 """Quantities of a pendulum, in the order of a plant file."""
 
@@ -227,6 +235,11 @@ class PlantParameters(_Pendulum):
                 object.__setattr__(self, name, part)
         for joint, own in zip(self.mechanism.joints, self.joints, strict=True):
             self._check_joint(joint, own)
+        if len({actuator.motor is None for actuator in self.actuators}) > 1:
+            raise ParameterError(
+                f"some actuators of plant {self.name!r} have a motor, and others none; expected all of them in volts, "
+                "or none"
+            )
         if self.is_pendulum:
             vars(self).update(self.numbers)
         else:
@@ -244,11 +257,19 @@ class PlantParameters(_Pendulum):
         low, high = own.lower_stop, own.upper_stop
         if low is not None and high is not None and not low < high:
             raise ParameterError(f"{where}lower_stop is {low} {joint.unit}; expected < upper_stop = {high}")
+        motor = None if own.actuator is None else own.actuator.motor
+        if motor is not None and not motor.dead_band < motor.voltage_limit:
+            raise ParameterError(
+                f"{where}dead_band is {motor.dead_band} V; expected < voltage_limit = {motor.voltage_limit} V"
+            )
 
     def _check_mass(self) -> None:
         turns = [2.0 * math.pi * index / _ANGLES for index in range(_ANGLES)]
         for q in product(*((turns if joint.turns else [0.0]) for joint in self.mechanism.joints)):
-            if not _positive_definite(self.mechanism.mass(q, self.packed)):
+            rows = self.mechanism.mass(q, self.packed)
+            if self.coordinates.volts:
+                self._check_inductance(rows)
+            if not _positive_definite(rows):
                 at = ", ".join(
                     f"{joint.name} = {value:.3g} {joint.unit}"
                     for joint, value in zip(self.mechanism.joints, q, strict=True)
@@ -258,13 +279,24 @@ class PlantParameters(_Pendulum):
                     "about the joint that its mass and centre can have, at least mass * centre^2"
                 )
 
+    def _check_inductance(self, mass: Sequence[Sequence[float]]) -> None:
+        for index, (name, own) in enumerate(zip(self.coordinates.names, self.joints, strict=True)):
+            motor = None if own.actuator is None else own.actuator.motor
+            if motor is not None and motor.inductance * motor.damping > _LATE * mass[index][index] * motor.resistance:
+                most = _LATE * mass[index][index] * motor.resistance / motor.damping
+                raise ParameterError(
+                    f"{name}: inductance is {motor.inductance} H; expected at most {most:.3g} H for this inertia and "
+                    "back EMF, which the equation applies without lag"
+                )
+
     @cached_property
     def is_pendulum(self) -> bool:
-        """Whether it is one driven hinge without end stops."""
+        """Whether it is one hinge, driven by a torque, without end stops."""
         own = self.joints[0]
         return (
             self.mechanism.name == _PENDULUM.name
             and own.actuator is not None
+            and own.actuator.motor is None
             and own.lower_stop is own.upper_stop is None
         )
 
@@ -277,12 +309,52 @@ class PlantParameters(_Pendulum):
     def coordinates(self) -> Coordinates:
         """Joints, and which of them are driven."""
         driven = tuple(index for index, joint in enumerate(self.joints) if joint.actuator is not None)
-        return Coordinates(self.mechanism.joints, driven)
+        return Coordinates(self.mechanism.joints, driven, volts=any(own.motor is not None for own in self.actuators))
 
     @cached_property
     def packed(self) -> Vector:
-        """The mechanism's ``p``: values, then the damping of each joint."""
-        return (*self.values, *(joint.damping for joint in self.joints))
+        """The mechanism's ``p``: values, then the damping of each joint, with that of its motor's back EMF."""
+        return (*self.values, *(joint.total_damping for joint in self.joints))
+
+    @cached_property
+    def torque_plant(self) -> PlantParameters:
+        """The plant behind its motors, driven by their efforts at standstill; itself if it has no motor.
+
+        Its damping includes the back EMF. :attr:`gains`, or with dead bands :meth:`stall_efforts`, convert commands.
+        """
+        if not self.coordinates.volts:
+            return self
+        joints = [
+            own if own.actuator is None else replace(
+                own, damping=own.total_damping, actuator=replace(own.actuator, motor=None)
+            )
+            for own in self.joints
+        ]  # fmt: skip
+        return PlantParameters(self.mechanism, self.values, tuple(joints), self.name)
+
+    @cached_property
+    def gains(self) -> Vector:
+        """Effort per command of each driven joint, without dead band: 1, or with a motor [N m/V or N/V]."""
+        return tuple(1.0 if own.motor is None else own.motor.gain for own in self.actuators)
+
+    def stall_efforts(self, commands: Sequence[float]) -> Vector:
+        """Return the efforts of m commands at standstill [N m or N]."""
+        return tuple(
+            command if own.motor is None else own.motor.stall_effort(command)
+            for own, command in zip(self.actuators, commands, strict=True)
+        )
+
+    def voltage_efforts(self, commands: Vector, velocity: Vector) -> Vector:
+        """Return the efforts of m commands at n velocities [N m or N]."""
+        return self.motor_efforts(self.stall_efforts(commands), velocity)
+
+    def motor_efforts(self, stall: Vector, velocity: Vector) -> Vector:
+        """Return m efforts at standstill less those of the back EMF at n velocities [N m or N]."""
+        driven = zip(self.actuators, self.coordinates.driven, stall, strict=True)
+        return tuple(
+            effort if own.motor is None else effort - own.motor.damping * velocity[index]
+            for own, index, effort in driven
+        )
 
     @property
     def actuators(self) -> tuple[Actuator, ...]:
@@ -291,8 +363,19 @@ class PlantParameters(_Pendulum):
 
     @property
     def effort_limits(self) -> Vector:
-        """Largest effort of each driven joint [N m or N]."""
+        """Largest effort of each driven joint, of a motor at standstill [N m or N]."""
         return tuple(actuator.effort_limit for actuator in self.actuators)
+
+    @property
+    def command_limits(self) -> Vector:
+        """Largest command of each driven joint, in the coordinates' ``drive_unit``."""
+        return tuple(actuator.command_limit for actuator in self.actuators)
+
+    @property
+    def weights(self) -> tuple[tuple[float, ...], float]:
+        """Default diagonal of Q, and R of the commands: that of the mechanism, for motors per square volt."""
+        q, r = self.mechanism.weights
+        return (q, r * sum(gain * gain for gain in self.gains) / len(self.gains)) if self.coordinates.volts else (q, r)
 
     @property
     def stops(self) -> tuple[tuple[float, float], ...]:
@@ -316,13 +399,15 @@ class PlantParameters(_Pendulum):
         return {
             name: place
             for name, place in _places(self.mechanism).items()
-            if place.part != "actuator" or self.joints[place.number].actuator is not None
+            if place.part in {"values", "joint"} or _has(self.joints[place.number].actuator, place)
         }
 
     def _at(self, place: _Place) -> Any:
         if place.part == "values":
             return self.values[place.number]
         joint = self.joints[place.number]
+        if place.part == "motor":
+            return getattr(joint.actuator and joint.actuator.motor, place.key)
         return getattr(joint if place.part == "joint" else joint.actuator, place.key)
 
     def _changed(self, changes: Mapping[_Place, Any]) -> tuple[Vector, tuple[JointParameters, ...]]:
@@ -332,8 +417,13 @@ class PlantParameters(_Pendulum):
                 values[place.number] = value
                 continue
             own, change = joints[place.number], {place.key: value}
-            if place.part == "actuator":
+            if place.part != "joint":
                 assert own.actuator is not None
+                if place.part == "motor":
+                    motor = own.actuator.motor
+                    assert motor is not None
+                    stale = {"time_constant": 0.0} if motor.inductance > 0.0 else {}
+                    change = {**stale, "motor": replace(motor, **change)}
                 change = {"actuator": replace(own.actuator, **change)}
             joints[place.number] = replace(own, **change)
         return tuple(values), tuple(joints)
@@ -418,6 +508,17 @@ class PlantParameters(_Pendulum):
         own = ", ".join(spec.name for spec in self.mechanism.parameters)
         joints = " or ".join(self.coordinates.names)
         return f"one of {own}, or JOINT.damping and the like with JOINT {joints}"
+
+
+def _has(actuator: Actuator | None, place: _Place) -> bool:
+    """Return whether an actuator has a number of its own; a motor determines effort limit and perhaps time constant."""
+    if actuator is None or actuator.motor is None:
+        return actuator is not None and place.part == "actuator"
+    return place.part == "motor" or place.key not in _determined(actuator.motor)
+
+
+def _determined(motor: Motor) -> tuple[str, ...]:
+    return ("effort_limit", "time_constant") if motor.inductance > 0.0 else ("effort_limit",)
 
 
 def pendulum_plant(
@@ -574,12 +675,35 @@ def _read_joint(joint: Joint, entry: object, where: str) -> tuple[JointParameter
     values, intervals = read_quantities(content, specs, where)
     parts: dict[str, Any] = {**values}
     if has_actuator:
-        drive, more = read_quantities(block, actuator_specs(joint), f"{where}.actuator")
-        if "effort_limit" not in drive:
-            raise ParameterError(f"{where}.actuator.effort_limit is missing; expected a value in {joint.effort_unit}")
-        parts["actuator"] = Actuator(**drive)
+        where = f"{where}.actuator"
+        drive: dict[str, Any]
+        entries = dict(require_mapping(block, where))
+        of_motor = entries.pop("motor", None)
+        drive, more = read_quantities(entries, actuator_specs(joint), where)
         intervals.update(more)
+        if of_motor is not None:
+            numbers, more = read_quantities(of_motor, motor_specs(joint), f"{where}.motor")
+            intervals.update(more)
+            drive = {**drive, "motor": _read_motor(joint, numbers, drive, where)}
+        elif "effort_limit" not in drive:
+            raise ParameterError(
+                f"{where}.effort_limit is missing; expected a value in {joint.effort_unit}, or a motor for commands in "
+                "volts"
+            )
+        parts["actuator"] = Actuator(**{"effort_limit": math.inf, **drive})
     return JointParameters(**parts), intervals
+
+
+def _read_motor(joint: Joint, numbers: dict[str, float], beside: Mapping[str, float], where: str) -> Motor:
+    for spec in motor_specs(joint)[:3]:
+        if spec.name not in numbers:
+            raise ParameterError(f"{where}.motor.{spec.name} is missing; expected a value in {spec.unit}")
+    motor = Motor(**numbers)
+    for name in _determined(motor):
+        if name in beside:
+            by = "voltage_limit" if name == "effort_limit" else "inductance / resistance"
+            raise ParameterError(f"{where}.{name} is given beside a motor; expected it left out: {by} is in its place")
+    return motor
 
 
 def write_plant(
@@ -616,12 +740,16 @@ def plant_document(
         return document
     joints: dict[str, Any] = {}
     for joint, own in zip(mechanism.joints, parameters.joints, strict=True):
-        specs, drives = _format_2(joint), actuator_specs(joint)
-        names = {spec.name: _name(mechanism, joint, spec.name) for spec in (*specs, *drives)}
+        specs, drives, motors = _format_2(joint), actuator_specs(joint), motor_specs(joint)
+        names = {spec.name: _name(mechanism, joint, spec.name) for spec in (*specs, *drives, *motors)}
         of_joint = {key: known[name] for key, name in names.items() if name in known}
         joints[joint.name] = write_quantities(vars(own), specs, of_joint)
         if own.actuator is not None:
-            joints[joint.name]["actuator"] = write_quantities(vars(own.actuator), drives, of_joint)
+            entry: dict[str, Any] = {}
+            if (motor := own.actuator.motor) is not None:
+                drives = tuple(spec for spec in drives if spec.name not in _determined(motor))
+                entry["motor"] = write_quantities(vars(motor), motors, of_joint)
+            joints[joint.name]["actuator"] = {**write_quantities(vars(own.actuator), drives, of_joint), **entry}
     own_values = write_quantities(parameters.numbers, mechanism.parameters, known)
     return {
         **document, "format": MECHANISM_FORMAT, "model": mechanism.name, "parameters": own_values, "joints": joints
@@ -657,9 +785,9 @@ def _is_mechanism(path: Path, text: str) -> bool:
 def require_one_joint(preset_or_path: str | Path, instead: str) -> None:
     """Raise a ParameterError for a plant of several joints; the message says what to use instead."""
     if is_mechanism(preset_or_path):
-        raise ParameterError(
-            f"plant is {preset_or_path}, which has several joints; expected one of one joint, or {instead}"
-        )
+        several = len(load_mechanism(preset_or_path).joints) > 1
+        has = "several joints" if several else "a motor in volts, or end stops"
+        raise ParameterError(f"plant is {preset_or_path}, which has {has}; expected one of one joint, or {instead}")
 
 
 def _positive_definite(rows: Sequence[Sequence[float]]) -> bool:
@@ -680,9 +808,13 @@ def pack_joints(parameters: PlantParameters) -> JointTable:
 
     Raises:
         ParameterError: The plant has a drivetrain, an offset or a further friction term, which the steps do not
-            support.
+            support, or a motor: they take its ``torque_plant``.
     """
     _require_rigid(parameters)
+    if parameters.coordinates.volts:
+        raise ParameterError(
+            f"plant {parameters.name!r} is driven in volts; expected one that is driven by an effort, without a motor"
+        )
     joints = parameters.joints
     return (
         tuple(joint.coulomb_friction for joint in joints),

@@ -29,8 +29,9 @@ _LOGGER = ("~/get_logger_levels", "~/set_logger_levels")
 _SILENT_PUBLISHER = ("/parameter_events",)
 _EVERY_PUBLISHER = (*_SILENT_PUBLISHER, "/rosout")
 _EVERY_SUBSCRIPTION = (names.CLOCK, "/parameter_events")
-_PLANT_SUBSCRIPTIONS = (names.EFFORT_COMMAND, names.DISTURBANCE, names.PUSH, names.JOINT_TRAJECTORY, names.ENABLE_INPUT)
-_PLANT_PUBLISHERS = (names.JOINT_STATES, names.APPLIED_EFFORT, names.EVENTS, names.DIAGNOSTICS)
+_COMMANDS, _DISTURBANCES, _APPLIED = zip(names.EFFORT_TOPICS, names.VOLTAGE_TOPICS, strict=True)
+_PLANT_SUBSCRIPTIONS = (*_COMMANDS, *_DISTURBANCES, names.PUSH, names.JOINT_TRAJECTORY, names.ENABLE_INPUT)
+_PLANT_PUBLISHERS = (names.JOINT_STATES, *_APPLIED, names.EVENTS, names.DIAGNOSTICS)
 _PLANT_SERVICES = (names.ARM, names.E_STOP_RESET)
 
 
@@ -45,7 +46,7 @@ _ANY = "{any}/"
 _RECORDED = "{recorded}"
 """All topics that a side's nodes publish there."""
 _READ_PARAMETERS = (_ANY + "list_parameters", _ANY + "get_parameters")
-_WATCHED = (names.APPLIED_EFFORT, names.EFFORT_COMMAND, names.DISTURBANCE, names.PUSH)
+_WATCHED = (*_APPLIED, *_COMMANDS, *_DISTURBANCES, names.PUSH)
 
 
 @dataclass(frozen=True)
@@ -91,7 +92,7 @@ NODES: dict[str, Permissions] = {
     "bridge_e_stop": Permissions(reply=(_PLANT + "e_stop",)),
     "bridge_e_stop_input": Permissions(subscribe=(names.E_STOP_INPUT,)),
     "controller": Permissions(
-        publish=(names.EFFORT_COMMAND, names.DIAGNOSTICS, "~/transition_event"),
+        publish=(*_COMMANDS, names.DIAGNOSTICS, "~/transition_event"),
         subscribe=(names.JOINT_STATES, names.DIAGNOSTICS),
         reply=(*_LIFECYCLE, *_LOGGER),
     ),
@@ -105,7 +106,7 @@ NODES: dict[str, Permissions] = {
         reply=_LOGGER,
     ),
     "disturbance": Permissions(
-        publish=(names.DISTURBANCE, names.EVENTS, names.DIAGNOSTICS),
+        publish=(*_DISTURBANCES, names.EVENTS, names.DIAGNOSTICS),
         subscribe=(names.JOINT_STATES,),
         reply=("~/start", "~/stop", *_LOGGER),
     ),
@@ -133,16 +134,7 @@ NODES: dict[str, Permissions] = {
     "console": Permissions(
         subscribe=(
             names.DIAGNOSTICS,
-            *(
-                _SIDE + name
-                for name in (
-                    names.EVENTS,
-                    names.JOINT_STATES,
-                    names.EFFORT_COMMAND,
-                    names.DISTURBANCE,
-                    names.APPLIED_EFFORT,
-                )
-            ),
+            *(_SIDE + name for name in (names.EVENTS, names.JOINT_STATES, *_COMMANDS, *_DISTURBANCES, *_APPLIED)),
         ),
         request=(
             *_READ_PARAMETERS,

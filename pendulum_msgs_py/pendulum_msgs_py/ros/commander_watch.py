@@ -30,7 +30,10 @@ class CommanderWatch:
     def __init__(self, node: Node, supervisor: PlantSupervisor) -> None:
         self._node = node
         self._supervisor = supervisor
-        self._commands = node.resolve_topic_name(names.EFFORT_COMMAND)
+        self._topics = supervisor.coordinates.topics
+        self._commands = node.resolve_topic_name(self._topics.command)
+        self.in_other_unit = ""
+        """Topics with commands in another unit than the plant's, which have no effect; empty for none."""
         self._states = node.resolve_topic_name(names.JOINT_STATES)
         self._looking = threading.Lock()
         self._checked_ns = 0
@@ -76,6 +79,20 @@ class CommanderWatch:
             if conflict and conflict != self._supervisor.commander_conflict:
                 self._node.get_logger().error(conflict)
             self._supervisor.set_commander_conflict(conflict)
+
+    def look_for_other_unit(self) -> None:
+        """Log publishers of commands in newton metres to a plant in volts, or the reverse."""
+        coordinates, text = self._supervisor.coordinates, ""
+        others, carried = (names.EFFORT_TOPICS, "efforts") if coordinates.volts else (names.VOLTAGE_TOPICS, "volts")
+        found = [name for name in others[:2] if self._node.count_publishers(self._node.resolve_topic_name(name))]
+        if found:
+            text = (
+                f"{' and '.join(found)} without effect, which carries {carried}: this plant is driven by "
+                f"{self._topics.command} in {coordinates.drive_unit}"
+            )
+        if text and text != self.in_other_unit:
+            self._node.get_logger().error(text)
+        self.in_other_unit = text
 
     def _check_soon(self, now: int) -> None:
         if now - self._checked_ns >= CHECK_PERIOD_NS:

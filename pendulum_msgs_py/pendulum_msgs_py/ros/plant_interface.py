@@ -68,6 +68,8 @@ class PlantInterface:
         statistics: The loop's figures, shown in diagnostics.
         more_diagnostics: Further values for diagnostics.
         on_command: Called after each accepted command of any torque input.
+        motor_efforts: For a plant in volts, its efforts under m voltages at n velocities, published as
+            ``applied_effort`` alongside ``applied_voltage``.
 
     Attributes:
         sample: Newest published state.
@@ -86,12 +88,14 @@ class PlantInterface:
         statistics: LoopStatistics | None = None,
         more_diagnostics: Callable[[], Mapping[str, object]] = dict,
         on_command: _CommandHook | None = None,
+        motor_efforts: Callable[[Vector, Vector], Vector] | None = None,
     ) -> None:
         self.node = node
         self.supervisor = supervisor
         self.clock = clock
         self.statistics = statistics
         self.sample: JointSample | None = None
+        self._decided: JointSample | None = None
         self.published_ns = 0
         self._armed_at = self._pressed_at = -math.inf
         self.arrived_ns = 0
@@ -111,7 +115,11 @@ class PlantInterface:
         self._stopping = False
         self._called: select.epoll | None = None
         self.state_publisher = node.create_publisher(JointState, names.JOINT_STATES, qos.STATE)
-        self.applied_publisher = node.create_publisher(JointState, names.APPLIED_EFFORT, qos.STATE)
+        topics = supervisor.coordinates.topics
+        self.applied_publisher = node.create_publisher(JointState, topics.applied, qos.STATE)
+        self._motor_efforts = motor_efforts
+        if motor_efforts is not None:
+            self._effort_publisher = node.create_publisher(JointState, names.APPLIED_EFFORT, qos.STATE)
         self._events = node.create_publisher(String, names.EVENTS, qos.EVENTS)
         self._diagnostics = Diagnostics(node, "plant")
         inputs = [Input.EFFORT_COMMAND, Input.DISTURBANCE] + ([Input.PUSH] if push else [])
@@ -119,16 +127,19 @@ class PlantInterface:
         self._torques: ArrivalSignal | None = None
         self._accepted: dict[Input, bytes] = {}
         self.inputs = {}
+        self._topics = {
+            Input.EFFORT_COMMAND: topics.command, Input.DISTURBANCE: topics.disturbance, Input.PUSH: names.PUSH
+        }  # fmt: skip
         self._receivers = {kind: self._receiver(kind) for kind in inputs}
         for kind in inputs:
             receive = self._receivers[kind]
             if polled:
-                source = node.create_polled_input(JointState, kind.value, qos.COMMAND_INPUT)
+                source = node.create_polled_input(JointState, self._topics[kind], qos.COMMAND_INPUT)
                 self._polled.append((source, receive))
                 self.inputs[kind] = source.subscription
             else:
                 self.inputs[kind] = node.create_subscription(
-                    JointState, kind.value, receive, qos.COMMAND_INPUT, raw=True
+                    JointState, self._topics[kind], receive, qos.COMMAND_INPUT, raw=True
                 )
         self._trajectories = node.create_polled_input(JointTrajectory, names.JOINT_TRAJECTORY, qos.TRAJECTORY)
         self._trajectories.watch()
@@ -200,6 +211,7 @@ class PlantInterface:
         """Return the supervisor's decision, and log changes."""
         if self._enable is not None and self._enable.came():
             self._receive_enable()
+        self._decided = self.sample
         drive = self.supervisor.decide(self.clock() if now_ns is None else now_ns, self.sample)
         report = (self.supervisor.mode, drive.starved, self.supervisor.trajectory_finished)
         if report != self._reported_mode:
@@ -208,8 +220,15 @@ class PlantInterface:
         return drive
 
     def publish_applied(self, stamp_ns: int, effort: Vector) -> None:
-        """Publish the efforts applied from the state with this stamp on."""
+        """Publish the commands applied from the state with this stamp on."""
         self.supervisor.report_applied(effort)
+        if (
+            self._motor_efforts is not None
+            and (state := self._decided or self.sample) is not None
+            and self._effort_publisher.get_subscription_count()
+        ):
+            torques = self._motor_efforts(effort, state.velocity)
+            self._effort_publisher.publish(encode_joints(stamp_ns, "", self._driven, (), (), torques))
         # Publishing without a subscriber would take a tenth of the loop.
         if self.applied_publisher.get_subscription_count():
             self.applied_publisher.publish(encode_joints(stamp_ns, "", self._driven, (), (), effort))
@@ -282,10 +301,13 @@ class PlantInterface:
         }
         for kind in self.inputs:
             gate = supervisor.gates[kind]
-            values[f"{kind.value}.accepted"] = gate.accepted
+            topic = self._topics[kind]
+            values[f"{topic}.accepted"] = gate.accepted
             for refusal, count in sorted(gate.refused.items()):
-                values[f"{kind.value}.refused.{refusal.value}"] = count
-                values[f"{kind.value}.newest_refused.{refusal.value}"] = gate.problems.get(refusal, "")
+                values[f"{topic}.refused.{refusal.value}"] = count
+                values[f"{topic}.newest_refused.{refusal.value}"] = gate.problems.get(refusal, "")
+        if self.commander_watch.in_other_unit:
+            values["commands_without_effect"] = self.commander_watch.in_other_unit
         for reason, count in self.refused_trajectories.items():
             values[f"joint_trajectory.refused.{reason}"] = count
         if self.statistics is not None:
@@ -425,6 +447,7 @@ class PlantInterface:
 
     def _on_housekeeping(self) -> None:
         self.commander_watch.check()
+        self.commander_watch.look_for_other_unit()
         seconds = sum(gate.refused[Refusal.SECOND_COMMANDER] for gate in self.supervisor.gates.values())
         self._second_commander = seconds > self._seconds_at_check
         self._seconds_at_check = seconds
@@ -461,7 +484,7 @@ class PlantInterface:
         refused = sum(sum(gate.refused.values()) for gate in gates.values())
         if refused > self._reported_refusals:
             details = ", ".join(
-                f"{kind.value} {refusal.value} {count} ({gate.problems.get(refusal, '')})"
+                f"{self._topics[kind]} {refusal.value} {count} ({gate.problems.get(refusal, '')})"
                 for kind, gate in gates.items()
                 for refusal, count in sorted(gate.refused.items())
             )
@@ -481,7 +504,7 @@ class PlantInterface:
             return DiagnosticStatus.ERROR
         starved = self._reported_mode is not None and self._reported_mode[1]
         conflict = bool(self.supervisor.commander_conflict)
-        warn = starved or conflict or self._second_commander
+        warn = starved or conflict or self._second_commander or bool(self.commander_watch.in_other_unit)
         return DiagnosticStatus.WARN if warn else DiagnosticStatus.OK
 
 

@@ -2,8 +2,9 @@
 
 Each plant has its own parameters, gain, start, seed and noise amplitude; of driven joint a of m, in step k::
 
-    u_a = clamp(-K_a [q - goal (wrapped where it turns), v] + noise(seed, (k // hold) m + a), effort limit of a)
+    u_a = clamp(-K_a [q - goal (wrapped where it turns), v] + noise(seed, (k // hold) m + a), limit of a)
 
+The command u_a of a motor is a voltage, and so are gain, noise and ``max_effort``; dead bands are refused.
 Equations, integrators and noise are those of the single plants of :mod:`pendulum_sim.stepping` and of
 ``pendulum_msgs_py.contract.noise``, compiled, so that one plant of a batch moves like one on the graph.
 Memory does not depend on the number of steps, unless trajectories are requested.
@@ -13,7 +14,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import fields, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +24,7 @@ from pendulum_msgs_py.contract.joints import Coordinates
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.joint_steps import COULOMB, JOINT_ROWS, LOWER, STATIC, UPPER
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_msgs_py.plants.joint_parameters import Motor
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, common_delay, pack_joints
 from pendulum_sim.batches.engine import Batch, Results, batch_size, finite_columns, seed_column
 from pendulum_sim.stepping.dry_friction import DRY, LAG, PACKED
@@ -37,6 +40,9 @@ __all__ = ["simulate_batch"]
 
 Array = NDArray[np.float64]
 Columns = dict[str, Array]
+
+
+_MOTOR = tuple(entry.name for entry in fields(Motor))
 
 
 class _Rows(NamedTuple):
@@ -85,7 +91,7 @@ def simulate_batch(
         gain: K, shape (m, 2n) or (B, m, 2n); None for an open loop.
         goal: n positions to regulate to; None for upright.
         seeds: Seeds of the noise, scalar or (B,), 0 to 2^64 - 1.
-        amplitude: Half width of the uniform noise on each driven joint, scalar, (m,) or (B, m) [N m or N].
+        amplitude: Half width of the uniform noise on each driven joint, scalar, (m,) or (B, m) [N m or N, or V].
         hold: Steps for which a noise sample is held, >= 1.
         record: Return the trajectories.
         threads: Threads to use; None for numba's default.
@@ -109,7 +115,7 @@ def simulate_batch(
         "gain": _gain_columns(gain, m, n),
         "amplitude": finite_columns("amplitude", amplitude, m),
         "goal": aim[None, :],
-        "limit": np.array([plant.effort_limits for plant in plants]),
+        "limit": np.array([plant.command_limits for plant in plants]),
         "delay": np.array([[common_delay(plant)] for plant in plants]),
     }
     if columns["amplitude"].size and columns["amplitude"].min() < 0.0:
@@ -120,7 +126,8 @@ def simulate_batch(
     batch_size({**lengths, "parameters": len(plants), "seeds": len(own_seeds)})
     rows = {name: list(column.T) for name, column in columns.items()}
     for index, name in zip(coordinates.driven, coordinates.driven_names, strict=True):
-        limit = varied.pop("effort_limit" if n == 1 else f"{name}.effort_limit", None)
+        prefix = f"{name}." if n > 1 else ""
+        limit = varied.pop(f"{prefix}{'voltage' if coordinates.volts else 'effort'}_limit", None)
         if limit is not None:
             rows["limit"][coordinates.driven.index(index)] = limit
     if plants[0].is_pendulum:
@@ -128,8 +135,16 @@ def simulate_batch(
     else:
         if method != "auto":
             raise ParameterError(f"method is {method!r}; expected auto for plants of {plants[0].mechanism.name}")
-        own = _joint_rows(plants, varied, dt / substeps)
+        motors = _motors(plants, varied) if coordinates.volts else []
+        own = _joint_rows(plants, varied, dt / substeps, motors)
         _check_starts(coordinates, rows["q"], own.table)
+        for a, motor in enumerate(motors):
+            # What follows is in efforts, of the plant behind its motors.
+            for name, width in (("gain", 2 * n), ("amplitude", 1), ("limit", 1)):
+                for row in range(a * width, (a + 1) * width):
+                    rows[name][row] = rows[name][row] * motor.gain
+        results = batch.run(own.layout, {**rows, "p": own.p, "table": own.table}, own_seeds, smooth=own.smooth)
+        return _in_volts(results, motors, coordinates) if motors else results
     return batch.run(own.layout, {**rows, "p": own.p, "table": own.table}, own_seeds, smooth=own.smooth)
 
 
@@ -162,7 +177,7 @@ def _checked_variations(variations: Mapping[str, ArrayLike], plants: Sequence[Pl
     found: Columns = {}
     for name, values in variations.items():
         key = name.rpartition(".")[2]
-        known = name in plant.mechanism.parameter_names or {key, key.removeprefix("actuator_")} & {*joint_rows}
+        known = name in plant.mechanism.parameter_names or {key, key.removeprefix("actuator_")} & {*joint_rows, *_MOTOR}
         if name not in plant.specs or not (known or key in {"effort_limit", "transport_delay"}):
             raise ParameterError(f"variation {name!r} is unknown; expected one of {', '.join(plant.specs)}")
         if key == "transport_delay":
@@ -208,7 +223,33 @@ def _pendulum_rows(plants: Sequence[PlantParameters], varied: Columns, method: s
     return _Rows(Layout(method), list(packed.values()), list(coefficients), smooth)
 
 
-def _joint_rows(plants: Sequence[PlantParameters], varied: Columns, h: float) -> _Rows:
+def _motors(plants: Sequence[PlantParameters], varied: Columns) -> list[Motor]:
+    """Return the driven joints' motors, whose values are columns; what varies of them is taken from ``varied``."""
+    found = []
+    names, several = plants[0].coordinates.driven_names, len(plants[0].joints) > 1
+    for each in zip(names, *(plant.actuators for plant in plants), strict=True):
+        name, motors = each[0], [actuator.motor for actuator in each[1:]]
+        columns: dict[str, Any] = {}
+        for key in _MOTOR:
+            own = [getattr(motor, key) for motor in motors]
+            column = varied.pop(f"{name}.{key}" if several else key, None)
+            columns[key] = column if column is not None else None if None in own else np.array(own)
+        if np.any(columns["dead_band"]):
+            raise ParameterError(f"the motor of {name} has a dead band; expected none in a batch")
+        found.append(Motor(**columns))
+    return found
+
+
+def _in_volts(results: Results, motors: Sequence[Motor], coordinates: Coordinates) -> Results:
+    """Return results whose efforts are the voltages that gave them."""
+    if (record := results.trajectories) is not None:
+        for index, motor in zip(coordinates.driven, motors, strict=True):
+            record[:, 2 * len(coordinates.joints) + index] /= motor.gain
+    gains = np.stack(np.broadcast_arrays(*(motor.gain for motor in motors)), axis=-1)
+    return replace(results, max_effort=results.max_effort / gains)
+
+
+def _joint_rows(plants: Sequence[PlantParameters], varied: Columns, h: float, motors: Sequence[Motor]) -> _Rows:
     """Return the rows of plants of any joints, integrated by Runge-Kutta of order four."""
     from pendulum_sim.batches.batch_kernels import Layout
 
@@ -217,7 +258,15 @@ def _joint_rows(plants: Sequence[PlantParameters], varied: Columns, h: float) ->
     first = plants[0]
     n, joints, names = len(first.joints), first.coordinates.names, first.mechanism.parameter_names
     p = list(np.array([plant.packed for plant in plants]).T)
-    table = list(np.array([np.concatenate([np.array(row) for row in pack_joints(plant)]) for plant in plants]).T)
+    table = list(
+        np.array([np.concatenate([np.array(row) for row in pack_joints(plant.torque_plant)]) for plant in plants]).T
+    )
+    for index, motor in zip(first.coordinates.driven, motors, strict=False):
+        own = np.array([plant.joints[index].damping for plant in plants])
+        row = len(first.mechanism.parameters) + index
+        p[row] = varied.pop(names[row], own) + motor.damping
+        if np.any(motor.inductance):
+            table[JOINT_ROWS.index("time_constant") * n + index] = motor.inductance / motor.resistance
     for name, values in varied.items():
         joint, _, key = name.rpartition(".")
         if name in names:
@@ -227,9 +276,10 @@ def _joint_rows(plants: Sequence[PlantParameters], varied: Columns, h: float) ->
             table[row * n + (joints.index(joint) if joint else 0)] = values
     for i, name in enumerate(joints):
         _check_friction(name, table[COULOMB * n + i], table[STATIC * n + i])
-    if varied:
+    if varied or motors:
         _check_masses(first, p, h)
-    smooth = all(map(is_smooth, plants)) and all(name in names for name in varied)
+    lagging = any(np.any(motor.inductance) for motor in motors)
+    smooth = all(map(is_smooth, plants)) and not lagging and all(name in names for name in varied)
     return _Rows(Layout("rk4", first.mechanism.name, first.coordinates.driven), p, table, smooth)
 
 

@@ -1,8 +1,9 @@
 """Gymnasium environments of a plant, single and vector: ``PendulumX59-v0``, ``PendulumAcrobot-v0`` and others.
 
 Observation: x = [deviation of each joint from upright, wrapped if it turns; velocity of each joint]. Action: one effort
-per driven joint [N m or N], clamped to its limit. Reward: -(x' Q x + u' R u) at the state of the action, with the
-mechanism's weights by default. Episodes never terminate; they are truncated after 5 s, or 10 s for a swing-up.
+per driven joint [N m or N], or voltage of its motor [V], clamped to its limit. Reward: -(x' Q x + u' R u) at the state
+of the action, with the plant's weights by default. Episodes never terminate; they are truncated after 5 s, or 10 s for
+a swing-up.
 
 Importing this module registers them, and so does ``gymnasium.make("pendulum_sim.environments.environment:ID")``.
 """
@@ -152,7 +153,13 @@ class PlantEnv(gymnasium.Env[Array, Array]):
             self._picture = PlantPicture(self.parameters, self._screen_size)
             self._window = Window(self._picture.size) if self.render_mode == "human" else None
         position, velocity = (tuple(rows[0].tolist()) for rows in self._motion.state)
-        effort = dict(zip(self.parameters.coordinates.driven_names, self._motion.effort.tolist(), strict=True))
+        effort = dict(
+            zip(
+                self.parameters.coordinates.driven_names,
+                self.parameters.stall_efforts(self._motion.effort.tolist()),
+                strict=True,
+            )
+        )
         self._picture.draw(position, velocity=velocity, effort=effort, time=self._steps * self.dt)
         if self._window is not None:
             self._window.show(self._picture, fps=round(1.0 / (self._steps_a_picture * self.dt)))

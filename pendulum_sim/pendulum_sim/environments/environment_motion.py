@@ -142,7 +142,7 @@ class Stepped:
 
     def _advance(self, effort: Array) -> None:
         torque = np.zeros_like(self.state[0])
-        torque[:, list(self._task.parameters.coordinates.driven)] = effort
+        torque[:, list(self._task.parameters.coordinates.driven)] = effort * np.array(self._task.parameters.gains)
         q, v, tau = (tuple(each.T) for each in (*self.state, torque))
         h, p = self._task.dt / self._task.substeps, self._task.parameters.packed
         for _ in range(self._task.substeps):

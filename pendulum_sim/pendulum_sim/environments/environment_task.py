@@ -65,9 +65,9 @@ class EnvironmentTask:
         self.start, self.disturbance, self.hold = start, float(disturbance), hold
         self.joints = n = len(parameters.joints)
         self.last = math.inf if math.isinf(episode_time) else max(1, math.ceil(episode_time / dt - 1e-9))
-        weights, cost = parameters.mechanism.weights
+        weights, cost = parameters.weights
         self.q, self.r = _checked_weights(weights if q is None else q, cost if r is None else r, n)
-        self.limits = np.array(parameters.effort_limits)
+        self.limits = np.array(parameters.command_limits)
         self._r = np.full(len(self.limits), self.r)
         self.goal = np.array(coordinates.goal)
         if start != "random":

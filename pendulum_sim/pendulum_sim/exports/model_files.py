@@ -108,7 +108,7 @@ def mjcf(parameters: PlantParameters) -> str:
 
     MuJoCo has no Stribeck curve, further friction terms, or hysteresis and hardening of a spring. Its dry friction
     creeps where this one sticks; its end stops are springs. A drivetrain is a second joint, the motor's, coupled by a
-    spring.
+    spring. A motor's control is its voltage, without dead band; its back EMF is the actuator's bias.
 
     Raises:
         ParameterError: A body has no positive inertia about its centre of mass.
@@ -119,6 +119,9 @@ def mjcf(parameters: PlantParameters) -> str:
     if one:
         gravity = STANDARD_GRAVITY if gravity > 0.0 else 0.0
     timestep = _TIMESTEP if drive is None else _STIFF_TIMESTEP
+    if not one and (lags := [actuator.time_constant for actuator in parameters.actuators if actuator.time_constant]):
+        # MuJoCo's Runge-Kutta integrates a lag too, and is unstable with longer steps.
+        timestep /= math.ceil(timestep / (2.0 * min(lags)))
     model = ElementTree.Element("mujoco", model=safe_name(parameters.name))
     add(model, "compiler", angle="radian", autolimits="true")
     integrator = "implicitfast" if one else "RK4"
@@ -151,9 +154,14 @@ def mjcf(parameters: PlantParameters) -> str:
     actuators = add(model, "actuator")
     for index, actuator in zip(parameters.coordinates.driven, parameters.actuators, strict=True):
         late = lateness(actuator.time_constant, actuator.transport_delay, timestep)
-        limit, joint_name = number(actuator.effort_limit), parameters.coordinates.names[index]
+        limit, joint_name = number(actuator.command_limit), parameters.coordinates.names[index]
         names = {"name": "effort" if one else joint_name, "joint": "motor_joint" if drive is not None else joint_name}
-        add(actuators, "general", {**late, **names, **gain}, ctrlrange=f"-{limit} {limit}", biastype="none")
+        bias = {"biastype": "none"}
+        if (motor := actuator.motor) is not None:
+            names["name"] = f"{joint_name}_voltage"
+            gain = {"gainprm": number(motor.gain)}
+            bias = {"biastype": "affine", "biasprm": f"0 0 {number(-motor.damping)}"}
+        add(actuators, "general", {**late, **names, **gain}, ctrlrange=f"-{limit} {limit}", **bias)
     return document_text(model)
 
 

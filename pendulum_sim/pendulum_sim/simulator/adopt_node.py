@@ -132,7 +132,8 @@ class AdoptNode(PollingNode):
         self._clock_ns = SteadyWallClock()
         limits = limits_from_parameters(
             values,
-            plant.effort_limits,
+            plant.command_limits,
+            push=plant.effort_limits,
             coordinates=plant.coordinates,
             lockstep=False,
             feedback_timeout=values["state_timeout"],
@@ -144,8 +145,9 @@ class AdoptNode(PollingNode):
         self._odd: Counter[str] = Counter()
         self._lines = Throttle(1.0)
         self._interface = PlantInterface(
-            self, self._supervisor, self._clock_ns, push=False, more_diagnostics=self._diagnostics
-        )
+            self, self._supervisor, self._clock_ns, push=False, more_diagnostics=self._diagnostics,
+            motor_efforts=plant.voltage_efforts if plant.coordinates.volts else None,
+        )  # fmt: skip
         self._interface.hardware_id = f"adopted {values['states']}"
         self._commands = self.create_publisher(Float64MultiArray, values["commands"], 10)
         # As bytes: an unreadable message must not end the node with the e-stop.
@@ -155,7 +157,9 @@ class AdoptNode(PollingNode):
             0.25 * values["state_timeout"], self._on_silence, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
         self._joint = ", ".join(map(repr, self._entries.names))
-        self.get_logger().info(f"adopts {self._joint} of {values['states']}, efforts to {values['commands']}")
+        self.get_logger().info(
+            f"adopts {self._joint} of {values['states']}, {self._coordinates.drive_unit} to {values['commands']}"
+        )
 
     def close(self) -> None:
         """Disarm, and send zero efforts: the plant may hold the last one forever."""

@@ -129,7 +129,10 @@ def _equation(values: Mapping[str, Any]) -> PlantParameters | None:
         raise ParameterError(
             f"plant is {values['plant']}, of one joint, whose equation is found; expected one of several, or none"
         )
-    return load_mechanism(values["plant"])
+    plant = load_mechanism(values["plant"])
+    if plant.coordinates.volts:
+        raise ParameterError(f"plant is {values['plant']}, driven in volts; expected one driven by an effort")
+    return plant
 
 
 def _make_gymnasium(values: Mapping[str, Any]) -> Simulation:

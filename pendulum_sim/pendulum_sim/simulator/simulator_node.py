@@ -106,7 +106,8 @@ class SimulatorNode(PollingNode):
         least = _LEAST_PERIODS * self._dt
         limits = limits_from_parameters(
             values,
-            self._plant.parameters.effort_limits,
+            parameters.command_limits,
+            push=parameters.effort_limits,
             coordinates=self._coordinates,
             lockstep=values["clock"] == "lockstep",
             least_command_timeout=least,
@@ -131,6 +132,7 @@ class SimulatorNode(PollingNode):
             statistics=None if self._lockstep else self._statistics,
             more_diagnostics=self._diagnostics,
             on_command=self._on_command if self._lockstep else None,
+            motor_efforts=parameters.voltage_efforts if self._coordinates.volts else None,
         )
         self._interface.hardware_id = f"simulated {parameters.name}"
         if self._lockstep:

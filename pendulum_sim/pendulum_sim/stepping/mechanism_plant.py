@@ -1,7 +1,8 @@
 """A plant of several joints, stepped under held commands.
 
-A command is clamped to the effort limit, waits for the transport delay, passes the first-order lag, and adds to
-gravity, friction and ``push``, as in :mod:`pendulum_sim.stepping.plant`.
+A command is clamped to its limit, waits for the transport delay, passes the first-order lag, and adds to gravity,
+friction and ``push``, as in :mod:`pendulum_sim.stepping.plant`. A motor's command is a voltage: its effort at
+standstill is what is stepped, on the ``torque_plant``, whose damping has the back EMF.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class MechanismState(NamedTuple):
         time: Time since the reset [s].
         position: n positions, not wrapped [rad or m].
         velocity: n velocities [rad/s or m/s].
-        effort: n efforts of the actuators, 0 at passive joints [N m or N].
+        effort: n efforts of the actuators, of motors less their back EMF, 0 at passive joints [N m or N].
     """
 
     time: float
@@ -55,11 +56,12 @@ class MechanismPlant:
         self.parameters = parameters
         self.dt = dt
         self._p = parameters.packed
-        self._table = pack_joints(parameters)
+        self._table = pack_joints(parameters.torque_plant)
         self._forward = parameters.mechanism.forward
         self._along, self._put, self._lag = joint_functions(len(parameters.joints))
         self._plain = not _has_events(parameters)
-        self._limits = parameters.effort_limits
+        self._limits = parameters.command_limits
+        self._motors = parameters.coordinates.volts
         self._spread = parameters.coordinates.spread
         delay = common_delay(parameters)
         self._delays = [DelayLine(delay, dt) for _ in self._limits]
@@ -72,7 +74,7 @@ class MechanismPlant:
     @property
     def state(self) -> MechanismState:
         """The present state."""
-        return MechanismState(self._steps * self.dt, self._position, self._velocity, self._effort)
+        return self._state()
 
     def reset(self, position: Vector | None = None, velocity: Vector | None = None) -> MechanismState:
         """Restart at n positions [rad or m] and velocities, 0 by default, with actuators and delays empty.
@@ -95,7 +97,7 @@ class MechanismPlant:
         """Advance by one period.
 
         Args:
-            effort: m commanded efforts, clamped to the limits [N m or N].
+            effort: m commands, clamped to the limits [N m or N, or V of a motor].
             push: n efforts on the joints themselves, neither clamped nor delayed; None for none.
 
         Raises:
@@ -114,8 +116,10 @@ class MechanismPlant:
             line.push(min(limit, max(-limit, value)))
             for line, limit, value in zip(self._delays, self._limits, effort, strict=True)
         ]
-        older = self._spread(tuple(pair[0] for pair in ends))
-        newer = self._spread(tuple(pair[1] for pair in ends))
+        before, after = tuple(pair[0] for pair in ends), tuple(pair[1] for pair in ends)
+        if self._motors:
+            before, after = self.parameters.stall_efforts(before), self.parameters.stall_efforts(after)
+        older, newer = self._spread(before), self._spread(after)
         q, v, torque = self._position, self._velocity, self._effort
         for is_newer, h in self._segments:
             command = newer if is_newer else older
@@ -130,7 +134,14 @@ class MechanismPlant:
             torque = self._lag(torque, command, h, self._table[LAG])
         self._position, self._velocity, self._effort = q, v, torque
         self._steps += 1
-        return MechanismState(self._steps * self.dt, q, v, torque)
+        return self._state()
+
+    def _state(self) -> MechanismState:
+        effort = self._effort
+        if self._motors:
+            stall = tuple(effort[index] for index in self.parameters.coordinates.driven)
+            effort = self._spread(self.parameters.motor_efforts(stall, self._velocity))
+        return MechanismState(self._steps * self.dt, self._position, self._velocity, effort)
 
     @property
     def energy(self) -> float:
@@ -139,14 +150,16 @@ class MechanismPlant:
 
 
 def is_smooth(parameters: PlantParameters) -> bool:
-    """Return whether a plant has no dry friction, end stops, lag, delay or drivetrain."""
-    late = any(actuator.transport_delay for actuator in parameters.actuators)
-    return parameters.drivetrain is None and not _has_events(parameters) and not late
+    """Return whether a plant has no dry friction, end stops, lag, delay, dead band or drivetrain."""
+    other = any(
+        actuator.transport_delay or (actuator.motor and actuator.motor.dead_band) for actuator in parameters.actuators
+    )
+    return parameters.drivetrain is None and not _has_events(parameters) and not other
 
 
 def check_stable_step(parameters: PlantParameters, h: float) -> None:
     """Raise a ParameterError, with the largest stable step, if damping makes RK4 unstable at this step."""
-    damping = np.diag([joint.damping for joint in parameters.joints])
+    damping = np.diag([joint.total_damping for joint in parameters.joints])
     n = len(parameters.joints)
     rate = 0.0
     for angle in np.linspace(0.0, np.pi, 9):

@@ -108,6 +108,7 @@ class _Kind:
     runs: int
     slides: bool
     driven: bool
+    effort: str
     runs_differ: bool
 
     @classmethod
@@ -122,15 +123,13 @@ class _Kind:
         slides = any(one.slides for one in motions)
         if slides:
             _refuse_angles(margins)
-        return cls(looks, runs, slides, any(np.ptp(one.effort) > 0.0 for one in motions), runs_differ)
+        driven = any(np.ptp(one.effort) > 0.0 for one in motions)
+        return cls(looks, runs, slides, driven, motions[0].effort_word, runs_differ)
 
     def name(self, quantity: str) -> str:
         """Return the field's word for a quantity: what slides has a position, and a force instead of a torque."""
-        return (
-            {"angle": "position", "angles": "positions", "torque": "force"}.get(quantity, quantity)
-            if self.slides
-            else quantity
-        )
+        words = {"angle": "position", "angles": "positions"} if self.slides else {}
+        return {**words, "torque": self.effort}.get(quantity, quantity)
 
 
 def _refuse_angles(margins: Margins) -> None:

@@ -20,7 +20,7 @@ _PATIENCE = 20.0
 """Longest wait for a node's response [s]."""
 _HALF_TURN = 3.15
 """Largest distance from hanging at 0 at the start of a ramp to upright, including noise [rad]."""
-_COMMANDS = (names.EFFORT_COMMAND, names.DISTURBANCE, names.JOINT_TRAJECTORY)
+_COMMANDS = (*names.EFFORT_TOPICS[:2], *names.VOLTAGE_TOPICS[:2], names.JOINT_TRAJECTORY)
 _OURS = ("controller", "disturbance", names.RECORDER)
 """Names of the nodes that an experiment starts with a plant."""
 

@@ -87,7 +87,7 @@ def _wait_for_hand(session: Session, plant: PlantClient, controller: Controller,
         sample = plant.sample
         assert sample is not None
         asked = controller.efforts(0.0, sample.position, sample.velocity)
-        near = all(abs(u) <= _NEAR * limit for u, limit in zip(asked, design.effort_limits, strict=True))
+        near = all(abs(u) <= _NEAR * limit for u, limit in zip(asked, design.command_limits, strict=True))
         if not near or has_fallen(design, sample.position):
             since.clear()
             return False

@@ -78,7 +78,7 @@ def _simulate(spec: RunSpec, plant: JointPlant, sensors: Sensors) -> RunArrays:
     coordinates, is_one = plant.parameters.coordinates, plant.parameters.is_pendulum
     limits: dict[str, Any] = validate(LIMIT_SPECS, BEGINS_ANYWHERE if is_one else {})
     supervisor = PlantSupervisor(
-        limits_from_parameters(limits, plant.parameters.effort_limits, coordinates=coordinates, lockstep=True),
+        limits_from_parameters(limits, plant.parameters.command_limits, coordinates=coordinates, lockstep=True),
         coordinates=coordinates,
     )
     design = load_mechanism(spec.design_plant)
@@ -88,6 +88,7 @@ def _simulate(spec: RunSpec, plant: JointPlant, sensors: Sensors) -> RunArrays:
     chosen = spec.disturbance_parameters()
     disturbed = tuple(chosen.pop("joints", coordinates.driven_names[:1]))
     length = chosen.pop("duration", 0.0)
+    chosen.pop("volts", None)
     signal = make_disturbance(validate(DISTURBANCE_SPECS, chosen))
     disturbance = DisturbanceLoop(signal, length, simulated_time=True)
     disturbance.start()

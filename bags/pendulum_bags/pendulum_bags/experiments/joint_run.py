@@ -38,7 +38,10 @@ __all__ = [
 Array = NDArray[Any]
 
 _UNCHANGED = frozenset(
-    {"gravity", "gear_ratio", "stribeck_velocity", "lower_stop", "upper_stop", "effort_limit", "time_constant"}
+    {
+        *("gravity", "gear_ratio", "stribeck_velocity", "lower_stop", "upper_stop", "time_constant"),
+        *("effort_limit", "voltage_limit"),
+    }
 )
 """Values of a plant file that are not identified: constants, limits, and those of a friction model."""
 _DELAY = "transport_delay"
@@ -157,10 +160,10 @@ def driven_joint(plant: str | PlantParameters, joint: str = "") -> str:
 
 
 def default_amplitude(plant: str | PlantParameters, joint: str = "") -> float:
-    """Return the largest effort of the noise, a share of its joint's effort limit [N m or N]."""
+    """Return the largest command of the noise, a share of its joint's limit [N m or N, or V]."""
     loaded = plant if isinstance(plant, PlantParameters) else load_mechanism(plant)
     index = loaded.coordinates.driven_names.index(driven_joint(loaded, joint))
-    return loaded.effort_limits[index] / LIMIT_PER_NOISE
+    return loaded.command_limits[index] / LIMIT_PER_NOISE
 
 
 def identified_names(plant: PlantParameters) -> list[str]:

@@ -40,15 +40,8 @@ _ALIVE = 10
 """States that must arrive between two checks; fewer means a run that has stopped."""
 _LISTENERS = 3
 """Subscribers of the plant's states: controller, disturbance, recorder. The orchestrator makes one more."""
-_RUN_LISTENERS = {
-    names.JOINT_STATES: _LISTENERS,
-    names.EFFORT_COMMAND: 2,
-    names.DISTURBANCE: 2,
-    names.APPLIED_EFFORT: 1,
-    names.EVENTS: 2,
-}
-"""Subscribers of each topic of a run: its reader, the recorder, and for events the orchestrator."""
-_PUBLISHED_EACH_STEP = (names.EFFORT_COMMAND, names.DISTURBANCE, names.APPLIED_EFFORT)
+_RUN_LISTENERS = {"command": 2, "disturbance": 2, "applied": 1}
+"""Subscribers of a plant's commands: the plant and the recorder."""
 
 
 def run_lockstep(
@@ -118,13 +111,22 @@ def record_run(
         recorder = session.record(bag, namespace, spec.metadata(), spec.storage, simulated=simulated)
         program = spec.plant_program(_LISTENERS + 1)
         answering = (
-            spec.controller_program(_RUN_LISTENERS[names.EFFORT_COMMAND]),
-            spec.disturbance_program(_RUN_LISTENERS[names.DISTURBANCE]),
+            spec.controller_program(_RUN_LISTENERS["command"]),
+            spec.disturbance_program(_RUN_LISTENERS["disturbance"]),
         )
         for node, priority in (*((each, ANSWER_PRIORITY) for each in answering), (program, PLANT_PRIORITY)):
             start_loop(session.processes, node, priority, simulated=simulated)
         plant = PlantClient(session.orchestrator, namespace, program.node_name, watch=False)
-        session.wait_until_all_hear_each_other(namespace, _RUN_LISTENERS, clock=simulated)
+        session.wait_until_all_hear_each_other(
+            namespace,
+            # Of events the recorder and the orchestrator.
+            {
+                names.JOINT_STATES: _LISTENERS,
+                **{getattr(spec.topics, kind): count for kind, count in _RUN_LISTENERS.items()},
+                names.EVENTS: 2,
+            },
+            clock=simulated,
+        )
         session.drives(plant)
         if not simulated:
             _keep_time(session, plant, spec)
@@ -136,7 +138,7 @@ def record_run(
         if not spec.has_bridge:
             plant.resume(START_TIMEOUT)
         _wait_for_end(session.orchestrator, plant, spec.duration)
-        session.close_in_lockstep(recorder, plant, spec.steps + 1, _PUBLISHED_EACH_STEP)
+        session.close_in_lockstep(recorder, plant, spec.steps + 1, spec.topics)
     return bag
 
 

@@ -89,7 +89,8 @@ def record_simulation(bag: Path, spec: RunSpec) -> Path:
 def _write(bag: Path, spec: RunSpec, run: RunArrays) -> None:
     metadata = spec.metadata()
     metadata[RUN_RECORD]["engine"] = "in_process"
-    topics = {name: f"{spec.namespace}/{name}" for name in names.SIGNALS}
+    own = spec.topics
+    topics = {name: f"{spec.namespace}/{name}" for name in (names.JOINT_STATES, *own)}
     events = f"{spec.namespace}/{names.EVENTS}"
     with BagWriter(bag, storage=spec.storage, metadata=metadata) as writer:
         for topic in topics.values():
@@ -108,9 +109,9 @@ def _write(bag: Path, spec: RunSpec, run: RunArrays) -> None:
         efforts = [
             (topics[name], source, joints, _rows(values))
             for name, source, joints, values in (
-                (names.EFFORT_COMMAND, "controller", driven, run.command),
-                (names.DISTURBANCE, "disturbance", disturbed, run.disturbance),
-                (names.APPLIED_EFFORT, "", driven, run.applied),
+                (own.command, "controller", driven, run.command),
+                (own.disturbance, "disturbance", disturbed, run.disturbance),
+                (own.applied, "", driven, run.applied),
             )
         ]
         event(stamps[0], START_EVENT)

@@ -58,7 +58,7 @@ THESIS_METHOD = "euler"
 """Integrator of the thesis's simulation, for rigid plants."""
 PERIODS = {"sim": 0.002, "hw": 0.01}
 """Period of the states of each plant, as in the thesis; of several joints, both have that of the simulator [s]."""
-_OF_THE_NODE = {"duration", "file", "joints"}
+_OF_THE_NODE = {"duration", "file", "joints", "volts"}
 """Parameters of the disturbance that are the node's, not the signal's."""
 
 
@@ -143,6 +143,11 @@ class RunSpec:
         """The plant, if it has several joints; else None."""
         return load_mechanism(self.plant) if is_mechanism(self.plant) else None
 
+    @property
+    def topics(self) -> names.DriveTopics:
+        """Topics of the plant's commands."""
+        return names.EFFORT_TOPICS if (plant := self.mechanism) is None else plant.coordinates.topics
+
     def law(self, design: PlantParameters) -> dict[str, Any]:
         """Return the parameters of the controller, with the set point of one joint."""
         own = {"set_point": float(self.set_point)} if design.is_pendulum else {}
@@ -189,6 +194,8 @@ class RunSpec:
         values: dict[str, Any] = {"kind": "uniform", "amplitude": 0.0, "hold_time": 0.01}
         if (mechanism := self.mechanism) is not None:
             values["joints"] = list(mechanism.coordinates.driven_names[:1])
+            if mechanism.coordinates.volts:
+                values["volts"] = True
         values.update(self.disturbance)
         return {**values, "seed": self.seed}
 

@@ -15,7 +15,7 @@ from pendulum_bags.frequency_response.compare import compare_responses
 from pendulum_bags.frequency_response.designs import DesignResult, certify_designs, policies_of
 from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.layers import GAP_MARGIN, LONGER, same_plant, which_controllers
-from pendulum_bags.frequency_response.record import Record, record_of_joints, record_of_run
+from pendulum_bags.frequency_response.record import INPUT_UNIT, Record, record_of_joints, record_of_run
 from pendulum_bags.frequency_response.result import Analysis
 from pendulum_bags.identification.joint_recordings import matched_joints
 from pendulum_bags.recordings.reading import Reading
@@ -132,7 +132,7 @@ def analyse_responses(
             responses = [replace(response, joints=own.coordinates.names) for response in responses]
             by_label = {response.label: response for response in responses}
         _refuse_other_joints(mechanism, responses[0])
-        model, (q, r) = linearise(mechanism), mechanism.mechanism.weights
+        model, (q, r) = linearise(mechanism), mechanism.weights
         scaling = scaling or JointScaling.of_plant(mechanism, model.measured)
         machine = Machine.relative_to(by_label["hw"], model) if "hw" in by_label else None
         longer = longer or f"python -m pendulum_bags experiment joints --plant {plant} --periods 40"
@@ -169,6 +169,11 @@ def _refuse_other_joints(parameters: PlantParameters, measured: MeasuredResponse
             f"plant {parameters.name} has joints {', '.join(coordinates.names)}, driven: "
             f"{', '.join(coordinates.driven_names) or 'none'}; expected {', '.join(joints)}, driven: {driven} alone, "
             "as they were measured"
+        )
+    if (measured.facts.get(INPUT_UNIT) == "V") != coordinates.volts:
+        raise ParameterError(
+            f"plant {parameters.name} is driven in {coordinates.drive_unit}; expected one driven "
+            f"{'by an effort' if coordinates.volts else 'in V'}, as the input was measured"
         )
 
 

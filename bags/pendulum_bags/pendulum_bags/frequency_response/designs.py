@@ -106,7 +106,7 @@ class DesignResult:
 
 def read_designs(texts: Sequence[str], plant: PlantParameters, model: LinearModel) -> list[Design]:
     """Return LQRs and gains for one driven of several joints; a ParameterError if a text is no design."""
-    cost = plant.mechanism.weights[1]
+    cost = plant.weights[1]
     return [_static(text, cost, model) for text in _asked(texts, plant)]
 
 
@@ -131,7 +131,7 @@ def certify_designs(
         ParameterError: An invalid design, or a policy for another plant.
         DataError: A policy file cannot be read.
     """
-    cost = plant.mechanism.weights[1]
+    cost = plant.weights[1]
     simulated = discretise(certifier.plant, period)
     found = []
     for text in _asked(texts, plant):
@@ -155,7 +155,7 @@ def certify_designs(
 def _asked(texts: Sequence[str], plant: PlantParameters) -> list[str]:
     usual: Sequence[tuple[tuple[float, ...], float]] = THESIS_WEIGHTS
     if not plant.is_pendulum:
-        q, r = plant.mechanism.weights
+        q, r = plant.weights
         usual = [(q, r * share) for share in _OTHER_COSTS]
     written = (f"q={','.join(f'{weight:g}' for weight in q)} r={r:g}" for q, r in usual)
     return [text.strip() for text in list(texts) or written]

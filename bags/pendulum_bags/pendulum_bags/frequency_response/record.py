@@ -19,7 +19,10 @@ from pendulum_msgs_py.errors import DataError
 if TYPE_CHECKING:
     from pendulum_bags.runs.run_data import RunData
 
-__all__ = ["Record", "record_of_arrays", "record_of_joints", "record_of_run"]
+__all__ = ["INPUT_UNIT", "Record", "record_of_arrays", "record_of_joints", "record_of_run"]
+
+INPUT_UNIT = "input_unit"
+"""Fact on a run whose input is in volts."""
 
 _EXACT = 1e-6
 """Largest tolerated deviation of a stamp from the raster, as a share of the period."""
@@ -35,8 +38,8 @@ class Record:
 
     Attributes:
         period: Sampling period [s].
-        excitation: Known torque that was added, shape (n,) [N m or N].
-        torque: Total torque from each sample to the next, including the excitation, shape (n,) [N m or N].
+        excitation: Known torque that was added, shape (n,) [N m or N, or V].
+        torque: Total torque from each sample to the next, including the excitation, shape (n,) [N m or N, or V].
         outputs: Angle [rad] and velocity [rad/s] at each sample, shape (2, n); for k joints all positions, then all
             velocities, shape (2 k, n).
         disturbance: Parameters of the excitation; empty if unknown.
@@ -87,7 +90,7 @@ def _record(run: RunData, motions: Sequence[RunData]) -> Record:
             expected = (
                 "expected columns of both (--topic disturbance=COLUMN, --topic input=COLUMN name them)"
                 if run.of_file
-                else "expected the topics disturbance and applied_effort"
+                else "expected the topics disturbance and applied_effort, or those in volts"
             )
             raise DataError(
                 f"{run.source or run.label} holds no {what} during the noise; {expected}, so that excitation and "
@@ -95,7 +98,8 @@ def _record(run: RunData, motions: Sequence[RunData]) -> Record:
             )
     assert excitation is not None
     assert run.applied is not None
-    if run.window.effort_unit not in {"N m", "N"}:
+    # A file in volts tells nothing of its motor; a bag is of a plant whose file does.
+    if run.window.effort_unit not in {"N m", "N"} and (run.of_file or run.window.effort_unit != "V"):
         raise DataError(
             f"{run.source or run.label} has its input in {run.window.effort_unit}; expected N m or N: a mapping file "
             "states its unit"
@@ -130,7 +134,11 @@ def _record(run: RunData, motions: Sequence[RunData]) -> Record:
         _held_mean(run.applied, raster, period),
         outputs,
         dict(disturbance) if isinstance(disturbance, Mapping) else {},
-        {"source": run.source, "missed_states": run.missed_deadlines},
+        {
+            "source": run.source,
+            "missed_states": run.missed_deadlines,
+            **({INPUT_UNIT: "V"} if run.window.effort_unit == "V" else {}),
+        },
     )
 
 

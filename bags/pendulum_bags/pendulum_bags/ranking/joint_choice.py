@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.joint_run import fall_time
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_msgs_py.contract.names import EFFORT_COMMAND, JOINT_STATES
+from pendulum_msgs_py.contract.names import JOINT_STATES
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 from pendulum_rosbag.reader import read_bag
 
@@ -32,7 +32,7 @@ def joint_cost_parts(place: Path, spec: RunSpec) -> Array | None:
     else:
         with read_bag(place / "bag") as opened:
             states = opened.joints(f"{spec.namespace}/{JOINT_STATES}")
-            effort = opened.joints(f"{spec.namespace}/{EFFORT_COMMAND}").effort
+            effort = opened.joints(f"{spec.namespace}/{plant.coordinates.topics.command}").effort
         stamps, position, velocity = states.stamp_ns, states.position, states.velocity
     return cost_of_motion(plant, stamps, position, velocity, effort)
 
@@ -42,11 +42,11 @@ def cost_of_motion(
 ) -> Array | None:
     """Return the parts of the mean cost of a motion, shape (3,), by the plant's LQR; None where the plant fell.
 
-    Stamps have shape (s,) [ns], position and velocity (s, n) [rad or m, /s], effort of the motors (e, m) [N m or N].
+    Stamps have shape (s,) [ns], position and velocity (s, n) [rad or m, /s], commands (e, m).
     """
     if fall_time(plant, stamps, position) is not None:
         return None
-    q, r = plant.mechanism.weights
+    q, r = plant.weights
     n = position.shape[1]
     deviation = np.array([plant.coordinates.deviation(tuple(row)) for row in position])
     parts = [

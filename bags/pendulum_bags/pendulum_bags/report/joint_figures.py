@@ -27,7 +27,7 @@ def joints_together(comparisons: Mapping[str, Comparison]) -> Figure:
         panels.append(both_panel(f"{joint} [{unit}]", sim, hw, attrgetter("position")))
         panels.append(both_panel(f"velocity of {joint} [{unit}/s]", sim, hw, attrgetter("velocity")))
         if np.ptp(sim.effort) > 0.0 or np.ptp(hw.effort) > 0.0:
-            label = f"{'force' if sim.slides else 'torque'} at {joint} [{sim.effort_unit}]"
+            label = f"{sim.effort_word} at {joint} [{sim.effort_unit}]"
             panels.append(both_panel(label, sim, hw, attrgetter("effort"), "step"))
         ours, theirs = float(sim.position.std(ddof=1)), float(hw.position.std(ddof=1))
         spreads.append(

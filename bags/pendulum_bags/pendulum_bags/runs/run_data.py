@@ -235,9 +235,10 @@ def read_run(
         space = find_prefix(bag, prefix)
         topic = f"{space}/{names.JOINT_STATES}"
         states = _increasing(bag.array(topic) if joint is None else bag.joints(topic).of(joint))
-        commands = _optional(bag, f"{space}/{names.EFFORT_COMMAND}", joint)
-        disturbance = _optional(bag, f"{space}/{names.DISTURBANCE}", joint, otherwise_another=True)
-        applied = _optional(bag, f"{space}/{names.APPLIED_EFFORT}", joint)
+        topics = names.drive_topics(bag.topics, space)
+        commands = _optional(bag, f"{space}/{topics.command}", joint)
+        disturbance = _optional(bag, f"{space}/{topics.disturbance}", joint, otherwise_another=True)
+        applied = _optional(bag, f"{space}/{topics.applied}", joint)
         events = [event for event in bag.events() if event["topic"].startswith(f"{space}/")]
         metadata, damage = dict(bag.metadata), [*bag.damage, *bag.clock_notes]
     foreign = or_all and disturbance is None and not any(event["name"] == START_EVENT for event in events)
@@ -260,6 +261,7 @@ def read_run(
         _answers(stamps, commands, states["effort"]),
         name,
         "m" if slides else "rad",
+        "V" if topics is names.VOLTAGE_TOPICS and commands is not None else "",
     )
     span = (stop - start) / NANOSECONDS
     inside = (stamps >= start) & (stamps < stop)

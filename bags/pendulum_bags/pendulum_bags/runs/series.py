@@ -110,6 +110,11 @@ class Series:
         return self.drive_unit or ("N" if self.slides else "N m")
 
     @property
+    def effort_word(self) -> str:
+        """The field's word for the effort."""
+        return "voltage" if self.effort_unit == "V" else "force" if self.slides else "torque"
+
+    @property
     def period(self) -> float:
         """Median time between two samples [s]."""
         return float(np.median(np.diff(self.t)))

@@ -78,7 +78,7 @@ class ClosedLoops:
     def gain(self) -> Gain:
         """The LQR that holds every plant, designed on the nominal one."""
         plant = self.nominal
-        weights = (self.q, self.r) if plant.is_pendulum else plant.mechanism.weights
+        weights = (self.q, self.r) if plant.is_pendulum else plant.weights
         return settling_lqr(design_for(plant), *weights, self.dt)
 
     @property

@@ -54,7 +54,7 @@ class MonteCarlo(ClosedLoops):
     """What to draw and to run.
 
     Attributes:
-        amplitude: Largest noise on each driven joint; None for a tenth of its effort limit [N m or N].
+        amplitude: Largest noise on each driven joint; None for a tenth of its limit [N m or N, or V].
         hold_time: Time for which a noise sample is held [s].
         start: Largest distance of each joint's start from upright, uniform [rad or m].
         bound: Distance from upright that a run should not leave [rad or m].
@@ -78,7 +78,8 @@ class MonteCarlo(ClosedLoops):
         if not 0 <= self.seed < _SEEDS:
             raise ParameterError(f"seed is {self.seed}; expected 0 to {_SEEDS - 1}")
         one = self.nominal.is_pendulum
-        distance, _, effort = self.nominal.coordinates.units
+        coordinates = self.nominal.coordinates
+        distance, effort = coordinates.units[0], coordinates.drive_unit
         for name, value, unit, least in (
             ("dt", self.dt, "s", 1e-9),
             ("bound", self.bound, distance, 1e-9),
@@ -146,7 +147,9 @@ def _simulate(
         position=np.stack([drawn[name] for name in names.start], axis=1),
         gain=settings.gain.rows,
         seeds=drawn["noise_seed"],
-        amplitude=np.array(plant.effort_limits) / LIMIT_PER_NOISE if settings.amplitude is None else settings.amplitude,
+        amplitude=np.array(plant.command_limits) / LIMIT_PER_NOISE
+        if settings.amplitude is None
+        else settings.amplitude,
         hold=max(1, round(settings.hold_time / settings.dt)),
         record=record,
         threads=threads,

@@ -59,7 +59,7 @@ def _laws(spec: RunSpec) -> dict[str, dict[str, Any]]:
             if run.spec is not None
         }
         return {name: named[name] for name in dict.fromkeys((*_FIRST, *named))}
-    weights, cost = mechanism.mechanism.weights
+    weights, cost = mechanism.weights
     half = len(weights) // 2
     noise = {"duration": min(spec.duration, LENGTH)}
     laws: dict[str, dict[str, Any]] = {}

@@ -81,7 +81,8 @@ def episodes_of(bag: Bag, fps: int) -> list[Episode]:
 def _commanded(bag: Bag) -> Iterator[tuple[str, str]]:
     """Yield the topics of states that have a topic of commands alongside, with it."""
     for topic in sorted(bag.topics):
-        commanded = f"{topic.removesuffix(names.JOINT_STATES)}{names.EFFORT_COMMAND}"
+        space = topic.removesuffix(names.JOINT_STATES)
+        commanded = f"{space}{names.drive_topics(bag.topics, space.rstrip('/')).command}"
         if topic.rpartition("/")[2] == names.JOINT_STATES and commanded in bag.topics:
             yield topic, commanded
 

@@ -15,7 +15,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pendulum_msgs_py.atomic_write import writing
-from pendulum_msgs_py.contract.names import APPLIED_EFFORT, DISTURBANCE, JOINT_STATES
+from pendulum_msgs_py.contract.names import (
+    APPLIED_EFFORT,
+    APPLIED_VOLTAGE,
+    DISTURBANCE,
+    JOINT_STATES,
+    VOLTAGE_DISTURBANCE,
+    VOLTAGE_TOPICS,
+)
 from pendulum_msgs_py.errors import BagError, DataError, ParameterError
 from pendulum_msgs_py.json_values import without_nan
 from pendulum_msgs_py.programs.extras import how_to_install
@@ -121,11 +128,26 @@ def export_bag(
     return [folder / path.name for path in files]
 
 
+_INPUTS = {
+    DISTURBANCE: "disturbance_effort",
+    APPLIED_EFFORT: "applied_effort",
+    VOLTAGE_DISTURBANCE: "disturbance_voltage",
+    APPLIED_VOLTAGE: "applied_voltage",
+}
+"""Columns that states get from other topics."""
+
+
 def _with_inputs(bag: Bag, topic: str, table: pd.DataFrame) -> pd.DataFrame:
-    """Return states with disturbance and applied torque, held at each, so that one file has input and output."""
+    """Return states with disturbance and applied torque, held at each, so that one file has input and output.
+
+    Voltages, which a JointState carries as efforts, get their name.
+    """
+    if topic.endswith(VOLTAGE_TOPICS):
+        names = {name: f"{name[:-6]}voltage" for name in map(str, table) if name.rpartition(".")[2] == "effort"}
+        return table.rename(columns=names)
     if not topic.endswith(JOINT_STATES) or "stamp_ns" not in table:
         return table
-    for signal, column in ((DISTURBANCE, "disturbance_effort"), (APPLIED_EFFORT, "applied_effort")):
+    for signal, column in _INPUTS.items():
         other = f"{topic.removesuffix(JOINT_STATES)}{signal}"
         if other not in bag.topics:
             continue

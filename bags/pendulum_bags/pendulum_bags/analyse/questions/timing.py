@@ -28,7 +28,7 @@ def answer(path: Reading, plant: str) -> dict[str, Any]:
     states = found.topics[f"{plant}/{names.JOINT_STATES}"]
     row: dict[str, Any] = {f"states_{name}": getattr(states, name) for name in ("count", "rate", "jitter", "longest")}
     row |= {f"states_{name}": getattr(states, name) for name in ("gaps", "missing", "clock_jumps")}
-    answered = f"{plant}/{names.EFFORT_COMMAND}"
+    answered = f"{plant}/{names.drive_topics(found.topics, plant).command}"
     for latency in found.latencies:
         if latency.answer == answered and latency.source == f"{plant}/{names.JOINT_STATES}":
             row |= {"answer_median": latency.median, "answer_p99": latency.p99}
