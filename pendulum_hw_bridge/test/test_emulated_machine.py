@@ -84,6 +84,26 @@ def test_a_torque_ends_by_itself_with_the_lifetime_of_its_command() -> None:
     assert machine.drives[0].expiries == 1
 
 
+def test_a_motor_in_volts_takes_a_duty_and_brakes_by_its_back_emf_only_while_it_is_on() -> None:
+    machine = started("qube_servo", INSTANT)
+    machine.deliver(0, 5.0 / 24.0, 0)
+    machine.advance_to(300 * MILLISECOND, wholly=True)
+    speed, torque = machine.state[1][0], machine.state[2][0]
+    assert speed > 1.0
+    assert torque == pytest.approx(0.005 * 5.0 - 0.042**2 / 8.4 * speed, rel=1e-3)
+    record = machine.feedback(0, SECOND)
+    assert record is not None
+    assert record.pwm_command == pytest.approx(5.0 / 24.0)
+    machine.deliver(0, 1.0, 300 * MILLISECOND)
+    machine.advance_to(302 * MILLISECOND, wholly=True)
+    # 24 V are asked for, the amplifier gives 10.
+    assert machine.state[2][0] < 0.005 * 10.0
+    machine.switch(0, 302 * MILLISECOND, on=False)
+    machine.advance_to(310 * MILLISECOND, wholly=True)
+    assert abs(machine.state[1][0]) > 1.0
+    assert machine.state[2] == (pytest.approx(0.0, abs=1e-9), 0.0)
+
+
 def test_a_drive_that_is_off_makes_no_torque_and_forgets_what_was_on_its_way() -> None:
     machine = started("double_pendulum")
     machine.deliver(0, 1.0, 0)

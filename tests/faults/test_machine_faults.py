@@ -100,7 +100,7 @@ def held(plant: str = "cart_pole", **given: Any) -> Machine:
 
 
 @pytest.mark.parametrize(
-    "plant", ["cart_pole", "acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "furuta"]
+    "plant", ["cart_pole", "acrobot_frictionless", "pendubot_frictionless", "double_pendulum", "furuta", "qube_servo"]
 )
 def test_the_lqr_of_the_simulated_plant_holds_the_emulated_machine_upright(plant: str) -> None:
     machine = held(plant, upright=0.005)

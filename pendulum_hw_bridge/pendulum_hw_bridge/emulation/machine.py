@@ -222,7 +222,7 @@ class EmulatedMachine:
     def _flow(self, time_ns: int) -> None:
         """Integrate up to a time, between events."""
         plant = self._behind
-        forward, p = plant.mechanism.forward, plant.packed
+        forward, p = plant.mechanism.forward, self._packed()
         command = self.coordinates.spread(self._stall())
         while self._now_ns < time_ns:
             step_ns = min(_STEP_NS, time_ns - self._now_ns)
@@ -261,7 +261,21 @@ class EmulatedMachine:
     def _net(self) -> Vector:
         """Return the efforts of the drives, of motors less their back EMF [N m or N]."""
         driven = tuple(self._effort[index] for index in self.coordinates.driven)
-        return self.plant.motor_efforts(driven, self._velocity) if self.coordinates.volts else driven
+        if not self.coordinates.volts:
+            return driven
+        # An amplifier that is off is open: no current flows, so that its motor does not brake either.
+        net = zip(driven, self.plant.motor_efforts(driven, self._velocity), self.drives, strict=True)
+        return tuple(braked if drive.on else effort for effort, braked, drive in net)
+
+    def _packed(self) -> Vector:
+        """Return the parameters of the equation, with the back EMF of motors that are on."""
+        packed, off = self._behind.packed, [index for index, drive in enumerate(self.drives) if not drive.on]
+        if not (off and self.coordinates.volts):
+            return packed
+        damping = list(packed[len(self.plant.values) :])
+        for joint in (self.coordinates.driven[index] for index in off):
+            damping[joint] = self.plant.joints[joint].damping
+        return (*self.plant.values, *damping)
 
     def _end(self, index: int) -> None:
         """End a drive's torque, including delayed ones."""

@@ -1,0 +1,45 @@
+"""Runs of a plant in volts: simulated, recorded, read back, and exported."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pendulum_bags.experiments.in_process import simulate
+from pendulum_bags.experiments.repeats import record_simulation
+from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.frequency_response.record import INPUT_UNIT, record_of_joints
+from pendulum_bags.runs.run_data import read_run
+from pendulum_msgs_py.contract.names import VOLTAGE_TOPICS
+from pendulum_rosbag.reader import read_bag
+from pendulum_rosbag.reader.tables import export_bag
+
+SPEC = RunSpec(
+    plant="qube_servo", design_plant="qube_servo", duration=1.0, method="auto",
+    disturbance={"amplitude": 1.0, "joints": ["arm"], "volts": True},
+)  # fmt: skip
+
+
+def test_a_run_in_volts_is_recorded_and_read_back_in_volts(tmp_path: Path) -> None:
+    bag = record_simulation(tmp_path / "sim", SPEC)
+    run = simulate(SPEC)
+    with read_bag(bag) as opened:
+        assert {f"/sim/{name}" for name in VOLTAGE_TOPICS} <= set(opened.topics)
+        assert not {"/sim/effort_command", "/sim/disturbance", "/sim/applied_effort"} & set(opened.topics)
+        export_bag(opened, tmp_path / "tables", format="csv")
+    arm = read_run(bag, joint="arm")
+    assert arm.window.effort_unit == "V"
+    assert arm.window.effort_word == "voltage"
+    count = arm.window.effort.size
+    np.testing.assert_array_equal(arm.window.effort, run.command[:count, 0])
+    assert arm.applied is not None
+    np.testing.assert_array_equal(arm.applied.value, run.applied[: arm.applied.value.size, 0])
+    record = record_of_joints({name: read_run(bag, joint=name) for name in ("arm", "pendulum")}, "arm")
+    assert record.facts[INPUT_UNIT] == "V"
+    assert np.abs(record.excitation).max() == pytest.approx(1.0, rel=0.1)
+    commands = pd.read_csv(tmp_path / "tables" / "sim__voltage_command.csv")
+    assert "effort" not in commands
+    assert commands["voltage"].tolist() == pytest.approx(run.command[: len(commands), 0].tolist())
+    states = pd.read_csv(tmp_path / "tables" / "sim__joint_states.csv")
+    assert {"applied_voltage", "disturbance_voltage"} <= set(states)
