@@ -104,6 +104,19 @@ def test_a_motor_in_volts_takes_a_duty_and_brakes_by_its_back_emf_only_while_it_
     assert machine.state[2] == (pytest.approx(0.0, abs=1e-9), 0.0)
 
 
+def test_a_motor_that_is_off_does_not_brake() -> None:
+    lossless = load_mechanism("qube_servo").with_values({"arm.damping": 0.0, "pendulum.damping": 0.0})
+    losses = []
+    for on in (False, True):
+        machine = EmulatedMachine(lossless, INSTANT, position=(0.0, 2.5))
+        machine.switch(0, 0, on=on)
+        begin = lossless.energy(*machine.state[:2])
+        machine.advance_to(400 * MILLISECOND, wholly=True)
+        losses.append(1.0 - lossless.energy(*machine.state[:2]) / begin)
+    assert abs(losses[0]) < 1e-4
+    assert losses[1] > 0.02
+
+
 def test_a_drive_that_is_off_makes_no_torque_and_forgets_what_was_on_its_way() -> None:
     machine = started("double_pendulum")
     machine.deliver(0, 1.0, 0)

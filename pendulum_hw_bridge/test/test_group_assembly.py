@@ -120,3 +120,10 @@ def test_each_joint_has_its_own_largest_effort_in_its_module_its_mapping_and_its
     assert [module.mapping.effort_limit for module in modules if isinstance(module, DrivenModule)] == [6.0, 2.0]
     first, second = (module.monitor.limits.measured_effort for module in modules)
     assert first > second > 2.0
+
+
+def test_modules_that_take_a_torque_get_no_plant_in_volts() -> None:
+    with pytest.raises(
+        ParameterError, match="'qube_servo' is driven in volts; expected one driven by an effort: so are"
+    ):
+        assembled("qube_servo")

@@ -108,3 +108,9 @@ def test_a_command_in_another_unit_moves_nothing_and_is_reported(
         return peer.states[-1].velocity[0] > 0.0
 
     peer.until(moved, "a motion")
+
+
+def test_a_controller_in_volts_sends_nothing_to_an_effort_controller(domain_id: int, processes) -> None:
+    refused = _start(processes, "pendulum_lqr", "controller", "plant:=qube_servo", "command_type:=multi_array")
+    assert refused.wait(60.0) == 2
+    assert "command_type is 'multi_array', of efforts, and plant 'qube_servo' is driven in volts" in refused.output

@@ -18,7 +18,7 @@ from pendulum_bags.frequency_response.designs import certify_designs
 from pendulum_bags.frequency_response.estimate import estimate
 from pendulum_bags.frequency_response.figures import response_figures
 from pendulum_bags.frequency_response.multisine import Multisine
-from pendulum_bags.frequency_response.record import Record
+from pendulum_bags.frequency_response.record import INPUT_UNIT, Record
 from pendulum_bags.verdict import Mark
 from pendulum_lqr.disturbances.disturbance import DISTURBANCE_SPECS, make_disturbance
 from pendulum_lqr.linear.design import output_lqr
@@ -120,6 +120,15 @@ def test_a_response_of_several_joints_survives_its_file(tmp_path: Any) -> None:
     again = read_response(write_response(tmp_path / "hw_response.json", measured))
     assert (again.joints, again.driven, again.driven_velocity) == (("arm", "pendulum"), 0, 2)
     assert np.array_equal(again.response, measured.response)
+
+
+def test_a_response_in_volts_is_none_of_a_plant_driven_by_a_torque_and_the_reverse() -> None:
+    torque = estimate(_record("furuta"))
+    volts = replace(torque, facts={**torque.facts, INPUT_UNIT: "V"})
+    with pytest.raises(ParameterError, match="plant furuta is driven in N m; expected one driven in V, as the input"):
+        analyse_responses([volts], "furuta")
+    with pytest.raises(ParameterError, match="plant qube_servo is driven in V; expected one driven by an effort, as"):
+        analyse_responses([torque], "qube_servo")
 
 
 def test_the_driven_joint_tells_delay_and_gain() -> None:
