@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pendulum_bags.commands import excite_cli, experiment_cli
+from pendulum_bags.commands import experiment_cli
 from pendulum_lqr.design_command import design_cli
 from pendulum_lqr.swing_up import swing_up_cli
 from pendulum_msgs_py.plants.plant_parameters import MECHANISM_PRESETS
@@ -39,7 +39,6 @@ REFUSED: dict[str, Callable[[Path], int]] = {
     "experiment ranking": _experiment("ranking", *SEVERAL),
     "experiment frequency_response": _experiment("frequency_response", *SEVERAL),
     "experiment leaderboard": _experiment("leaderboard", "--plants", "cart_pole"),
-    "excite": _of(excite_cli.main, *SEVERAL),
 }
 """Commands of the table with a no, and how it comes about."""
 WITHOUT_A_PLANT = {
@@ -68,6 +67,7 @@ TESTED = {
     "experiment monte_carlo": "bags/pendulum_bags/test/test_joint_monte_carlo.py",
     "experiment region_of_attraction": "bags/pendulum_bags/test/test_joint_region.py",
     "experiment study": "bags/pendulum_bags/test/test_study_files.py",
+    "excite": "bags/pendulum_bags/test/test_joint_excitation.py",
     "identify": "bags/pendulum_bags/test/test_mechanism_identification.py",
     "replay": "bags/pendulum_bags/test/test_mechanism_identification.py",
     "analyse": "bags/pendulum_bags/test/test_commands_on_files.py",

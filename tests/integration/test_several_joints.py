@@ -287,3 +287,20 @@ def test_the_nodes_of_a_foreign_model_of_two_joints_give_the_states_of_one_proce
     refused = processes.start("pendulum_bags", *command, "--q", "1", "1", "--bag", bag, alone=True)
     assert refused.wait(60.0) == 2
     assert "--q is for a plant of one joint, and cart_pole has several" in refused.output
+
+
+def test_an_excitation_of_two_joints_is_played_from_hanging_within_its_limits(
+    processes, domain_id: int, tmp_path: Path
+) -> None:
+    design = ("--plant", "cart_pole", "--duration", "3", "--trials", "1", "--kind", "prbs", "--max-travel", "0.2")
+    out = ("--out", tmp_path / "e.csv", "--play", "--bag", tmp_path / "bag")
+    run = processes.start("pendulum_bags", "excite", *design, *out, alone=True)
+    assert run.wait(120.0) == 0, run.output
+    with read_bag(tmp_path / "bag") as bag:
+        states, applied = bag.joints("/sim/joint_states"), bag.joints("/sim/applied_effort")
+        assert "pole_inertia" in bag.metadata["pendulum.excitation"]["predicted"]
+    assert states.position[0] == pytest.approx([0.0, 0.0], abs=0.01)
+    # A sensor of 1 mm.
+    assert 0.05 < np.abs(states.position[:, 0]).max() < 0.21
+    played = np.loadtxt(tmp_path / "e.csv", delimiter=",", skiprows=1)[:, 1]
+    np.testing.assert_allclose(applied.effort[: played.size, 0], played, atol=1e-6)

@@ -82,7 +82,7 @@ CONTROLLERS: dict[str, Row] = {
     "mpc": Row(f"{_HERE}.mpc:LinearMpc", _ANY),
     "nmpc": Row(f"{_HERE}.nmpc:NonlinearMpc", _RIGID, f"{_HERE}.joint_nmpc:JointNmpc"),
     "sliding_mode": Row(f"{_HERE}.sliding_mode:SlidingMode", _RIGID),
-    "playback": Row(f"{_HERE}.playback:Playback"),
+    "playback": Row(f"{_HERE}.playback:Playback", _ANY),
     "policy": Row(f"{_HERE}.policy:LearnedPolicy", _ANY),
 }
 

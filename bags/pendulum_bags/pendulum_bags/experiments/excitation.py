@@ -14,11 +14,11 @@ from typing import Any
 from pendulum_bags.experiments.domain import check_domain
 from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.orchestrator_node import Orchestrator, PlantClient, RecorderClient
-from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.experiments.run_spec import RunSpec, absolute_plant
 from pendulum_bags.experiments.session import ANSWER_PRIORITY, START_TIMEOUT, conduct, refuse_existing, start_loop
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_msgs_py.contract import names
-from pendulum_msgs_py.contract.angles import wrap
+from pendulum_msgs_py.contract.joints import ONE_JOINT, Coordinates
 from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.programs import graph
@@ -32,6 +32,8 @@ _AT_REST_ANGLE = 0.1
 _AT_REST_SPEED = 0.3
 """Limits of hanging at rest [rad], [rad/s]; a noisy velocity sensor shows up to 0.2 rad/s."""
 _ANGLE_ROOM = 1.2
+_FREE = 1e6
+"""Ends of the window of a joint that turns freely [rad]."""
 _SPEED_ROOM = 1.3
 """Factor on the design's limits at which the run ends: the prior plant is not the real one."""
 
@@ -46,8 +48,10 @@ class ExcitationPlay:
         period: Of the torque values [s].
         effort: Limit of the torque [N m].
         speed: Limit of the joint speed [rad/s].
-        angle: Limit of the distance from hanging down [rad].
+        reach: Limit of the distance of each joint from hanging down [rad or m].
         prediction: The bag's metadata of the design: ``predicted`` half widths by parameter, ``kind``, ``plant``.
+        coordinates: The plant's joints.
+        joint: Excited joint of several; empty for the one of a pendulum.
     """
 
     file: Path
@@ -55,14 +59,23 @@ class ExcitationPlay:
     period: float
     effort: float
     speed: float
-    angle: float
+    reach: tuple[float, ...]
     prediction: Mapping[str, Any] = field(default_factory=dict)
+    coordinates: Coordinates = ONE_JOINT
+    joint: str = ""
+
+    @property
+    def window(self) -> list[float]:
+        """Ends of each joint in turn at which the run ends; what turns freely has far ones [rad or m]."""
+        ends = [_FREE if math.isinf(reach) else _ANGLE_ROOM * reach for reach in self.reach]
+        return [end for reach in ends for end in (-reach, reach)]
 
     def zero_file(self, folder: Path) -> Path:
         """Write the controller's playback of zero torque, and return its path."""
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / "zero_torque.csv"
-        path.write_text("time,effort\n0,0\n1,0\n", encoding="utf-8")
+        nothing = ",0" * len(self.coordinates.driven)
+        path.write_text(f"time,effort\n0{nothing}\n1{nothing}\n", encoding="utf-8")
         return path
 
 
@@ -101,9 +114,12 @@ def play_in_lockstep(
     limits: dict[str, Any] = {
         "effort_limit": float(play.effort),
         "velocity_limit": _SPEED_ROOM * play.speed,
-        "position_window": [-_ANGLE_ROOM * play.angle, _ANGLE_ROOM * play.angle],
+        "position_window": play.window,
     }
     own = {"sensor.position_noise": float(noise)} if side == "sim" else {"feedback_rate": 1.0 / play.period}
+    if side == "sim" and play.joint:
+        # Velocities are differences of positions: exact ones would tell more than any encoder.
+        own["sensor.velocity_noise"] = math.sqrt(2.0) * noise / play.period
     if side == "hw":
         limits.pop("velocity_limit")  # the actuator's own is lower than most designs'
     spec = _LockstepRun(
@@ -112,7 +128,12 @@ def play_in_lockstep(
         design_plant=design_plant,
         controller="playback",
         controller_parameters={"file": str(play.zero_file(bag.parent / "logs" / bag.name).resolve())},
-        disturbance={"kind": "from_bag", "file": str(play.file.resolve()), "duration": float(play.duration)},
+        disturbance={
+            **({"joints": [play.joint]} if play.joint else {}),
+            "kind": "from_bag",
+            "file": str(play.file.resolve()),
+            "duration": float(play.duration),
+        },
         theta=0.0,
         duration=play.period * math.ceil((play.duration + _REST) / play.period),
         seed=seed,
@@ -142,19 +163,31 @@ def play_on_running_plant(
         orchestrator = session.orchestrator
         node_name = _find_plant(orchestrator, namespace)
         _refuse_others(orchestrator, namespace)
-        plant = PlantClient(orchestrator, namespace, node_name, controller="zero_torque", disturbance="excitation")
+        plant = PlantClient(
+            orchestrator,
+            namespace,
+            node_name,
+            controller="zero_torque",
+            disturbance="excitation",
+            joints=play.coordinates.names,
+        )
         orchestrator.wait_for(f"a state of {namespace}", lambda: plant.sample is not None, _FIND_TIMEOUT)
-        _require_rest(orchestrator, plant)
+        _require_rest(orchestrator, plant, play.coordinates)
         armed = _is_armed(plant, may_arm=arm)
         run = {"experiment": "excitation", "namespace": namespace, "plant": node_name, "clock": "realtime"}
         recorder = session.record(
             bag, namespace, {RUN_RECORD: run, "pendulum.excitation": dict(play.prediction)}, "mcap"
         )
+        of_joints = {"plant": absolute_plant(str(play.prediction["plant"]))} if play.joint else {}
         zero = graph.controller(
-            namespace, controller="playback", file=str(play.zero_file(logs).resolve()), period=play.period
+            namespace, controller="playback", file=str(play.zero_file(logs).resolve()), period=play.period, **of_joints
         )
         signal = graph.disturbance(
-            namespace, kind="from_bag", file=str(play.file.resolve()), duration=float(play.duration)
+            namespace,
+            kind="from_bag",
+            file=str(play.file.resolve()),
+            duration=float(play.duration),
+            **({"joints": [play.joint]} if play.joint else {}),
         )
         for program, name in ((zero, "zero_torque"), (signal, "excitation")):
             start_loop(session.processes, replace(program, name=name), ANSWER_PRIORITY)
@@ -205,18 +238,21 @@ def _refuse_others(orchestrator: Orchestrator, namespace: str) -> None:
             )
 
 
-def _require_rest(orchestrator: Orchestrator, plant: PlantClient) -> None:
+def _require_rest(orchestrator: Orchestrator, plant: PlantClient, coordinates: Coordinates) -> None:
     for _ in range(10):
         orchestrator.spin(0.05)
         sample = plant.sample
         assert sample is not None
-        angle = wrap(sample.position[0])
-        # Negated, so that NaN is refused too.
-        if not (abs(angle) <= _AT_REST_ANGLE and abs(sample.velocity[0]) <= _AT_REST_SPEED):
-            raise FaultError(
-                f"{plant.namespace} is at {angle:.3f} rad and {sample.velocity[0]:.3f} rad/s; expected it hanging at "
-                f"rest, within {_AT_REST_ANGLE} rad and {_AT_REST_SPEED} rad/s"
-            )
+        hanging = coordinates.deviation(sample.position, (0.0,) * len(sample.position))
+        for joint, q, v in zip(coordinates.joints, hanging, sample.velocity, strict=True):
+            # Negated, so that NaN is refused too.
+            if not (abs(q) <= _AT_REST_ANGLE and abs(v) <= _AT_REST_SPEED):
+                whose = f" ({joint.name})" if len(hanging) > 1 else ""
+                raise FaultError(
+                    f"{plant.namespace} is at {q:.3f} {joint.unit} and {v:.3f} {joint.velocity_unit}{whose}; expected "
+                    f"it hanging at rest, within {_AT_REST_ANGLE} {joint.unit} and {_AT_REST_SPEED} "
+                    f"{joint.velocity_unit}"
+                )
 
 
 def _is_armed(plant: PlantClient, *, may_arm: bool) -> bool:
@@ -232,13 +268,15 @@ def _watch(plant: PlantClient, play: ExcitationPlay) -> bool:
     plant.check_mode()
     sample = plant.sample
     assert sample is not None
-    for value, limit, unit in (
-        (wrap(sample.position[0]), _ANGLE_ROOM * play.angle, "rad"),
-        (sample.velocity[0], _SPEED_ROOM * play.speed, "rad/s"),
-    ):
-        if not abs(value) <= limit:
-            raise FaultError(
-                f"{plant.namespace} is at {value:.3g} {unit}; expected at most {limit:.3g} {unit}: the plant is not "
-                "what the excitation was designed for; it is disarmed"
-            )
+    hanging = play.coordinates.deviation(sample.position, (0.0,) * len(sample.position))
+    for joint, q, v, reach in zip(play.coordinates.joints, hanging, sample.velocity, play.reach, strict=True):
+        for value, limit, unit in (
+            (q, _ANGLE_ROOM * reach, joint.unit),
+            (v, _SPEED_ROOM * play.speed, joint.velocity_unit),
+        ):
+            if not abs(value) <= limit:
+                raise FaultError(
+                    f"{plant.namespace} is at {value:.3g} {unit}; expected at most {limit:.3g} {unit}: the plant is "
+                    "not what the excitation was designed for; it is disarmed"
+                )
     return plant.newest_event(Event.NOISE_END) is not None

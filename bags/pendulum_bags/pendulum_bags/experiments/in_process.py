@@ -98,7 +98,7 @@ def _simulate(spec: RunSpec, plant: JointPlant, sensors: Sensors) -> RunArrays:
     joints, driven = len(coordinates.joints), len(coordinates.driven)
     states, commands = np.full((count + 1, 3, joints), np.nan), np.full((count + 1, 2, driven), np.nan)
     pushes = np.zeros(count + 1)
-    start = (spec.theta,) if is_one else coordinates.goal
+    start = (spec.theta,) if is_one else spec.start_position(plant.parameters)
     _, *state = plant.reset(start, (0.0,) * joints)
     sample = sensors.measure(LOCKSTEP_EPOCH_NS, *state)
     if sample is None:

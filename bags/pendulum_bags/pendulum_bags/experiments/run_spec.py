@@ -70,7 +70,7 @@ class RunSpec:
         side: ``sim`` for the simulator, ``hw`` for the emulated hardware.
         strategy: The actuator's conversion of torque into PWM (``hw``).
         disturbance: Parameters of the disturbance; empty for none.
-        theta: Initial angle; plants of several joints begin upright [rad].
+        theta: Initial angle; plants of several joints begin upright, or hanging at 0 [rad].
         set_point: Angle to hold, from upright [rad].
         duration: Length [s].
         method: Integrator of the simulator; Euler as in the thesis, but not for a plant with motor and spring.
@@ -148,6 +148,16 @@ class RunSpec:
         """Topics of the plant's commands."""
         return names.EFFORT_TOPICS if (plant := self.mechanism) is None else plant.coordinates.topics
 
+    @property
+    def hangs(self) -> bool:
+        """Whether a plant of several joints begins hanging, at an angle of 0; else it begins upright."""
+        return abs(self.theta) <= _AT_REST
+
+    def start_position(self, mechanism: PlantParameters) -> tuple[float, ...]:
+        """Return where the joints of a plant of several begin [rad or m]."""
+        goal = mechanism.coordinates.goal
+        return (0.0,) * len(goal) if self.hangs else goal
+
     def law(self, design: PlantParameters) -> dict[str, Any]:
         """Return the parameters of the controller, with the set point of one joint."""
         own = {"set_point": float(self.set_point)} if design.is_pendulum else {}
@@ -214,13 +224,13 @@ class RunSpec:
             # No parameter arms hardware: the orchestrator does, before it becomes the last listener.
             loop["seed"] = self.seed
             if mechanism is not None:
-                goal = list(mechanism.coordinates.goal)
-                rate = 1.0 / self.period
-                return graph.bridge("/hw", backend="emulator", initial_positions=goal, feedback_rate=rate, **loop)
+                begin = list(self.start_position(mechanism))
+                loop.setdefault("feedback_rate", 1.0 / self.period)
+                return graph.bridge("/hw", backend="emulator", initial_positions=begin, **loop)
             loop["initial_position"] = float(self.theta)
             return graph.bridge("/hw", backend="emulator", effort_strategy=self.strategy, **loop)
         if mechanism is not None:
-            loop.update(start="top", armed_at_start=True, paused=True)
+            loop.update(start="bottom" if self.hangs else "top", armed_at_start=True, paused=True)
         else:
             start = {"initial_theta": float(self.theta), "armed_at_start": True, "paused": True}
             loop = {**BEGINS_ANYWHERE, **loop, **start}

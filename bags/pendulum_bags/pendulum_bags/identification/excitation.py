@@ -17,15 +17,28 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.covariance import without
+from pendulum_bags.identification.joint_recordings import JointRecording
+from pendulum_bags.identification.mechanism_fit import Windows, prepare_windows
+from pendulum_bags.identification.mechanism_kernel import motion_kernel
+from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel
 from pendulum_bags.identification.model import BOUNDS, INDEX, from_plant
 from pendulum_bags.identification.problem import prepare, simulate
 from pendulum_bags.runs.datasets import Recording
+from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, common_delay
 
 __all__ = ["KINDS", "Excitation", "Limits", "design_excitation"]
 
 KINDS = ("multisine", "chirp", "prbs")
+_OF_ONE: tuple[str, ...] = ("inertia", "damping", "gravity", "coulomb_friction")
+_FRICTION = "coulomb_friction"
+_LEAD = 100
+"""Samples at rest before the excitation of several joints."""
+_COASTING = 0.6
+"""Time for which a slide must stay within its travel after the excitation [s]."""
+_STEP = 1e-4
+"""Step of differences, in the size of a parameter, and in rad, m, rad/s or m/s of a start."""
 NUISANCE = ("angle_offset", "transport_delay")
 """Parameters that a fit will also have to find."""
 
@@ -38,17 +51,24 @@ class Limits:
         effort: Torque [N m].
         speed: Joint speed [rad/s].
         angle: Distance from hanging down [rad].
+        travel: Of several joints, distance of a slide from its middle [m].
     """
 
     effort: float
     speed: float
     angle: float
+    travel: float = 0.3
 
     def __post_init__(self) -> None:
         """Check that all are positive."""
-        for name, unit in (("effort", "N m"), ("speed", "rad/s"), ("angle", "rad")):
+        for name, unit in (("effort", "N m"), ("speed", "rad/s"), ("angle", "rad"), ("travel", "m")):
             if not getattr(self, name) > 0.0:
                 raise DataError(f"limit of {name} is {getattr(self, name)} {unit}; expected > 0")
+
+    def of(self, plant: PlantParameters) -> Array:
+        """Return the largest distance of each joint from hanging, shape (n,) [rad or m]; a wheel may turn freely."""
+        free = {"m": self.travel, "rad": np.inf}
+        return np.array([self.angle if joint.turns else free[joint.unit] for joint in plant.coordinates.joints])
 
 
 @dataclass(frozen=True)
@@ -58,8 +78,8 @@ class Excitation:
     Args:
         kind: One of ``KINDS``.
         time: Start of each held value, shape (n,) [s].
-        effort: shape (n,) [N m].
-        position, velocity: Predicted motion, shape (n,) [rad], [rad/s].
+        effort: shape (n,) [N m or N].
+        position, velocity: Predicted motion, shape (n,) [rad], [rad/s]; of several joints (n, joints).
         predicted: Half width of the predicted 95 % interval by parameter, in its unit.
         relative: The same, relative to the parameter.
         score: Mean log of the relative half widths; less is better.
@@ -90,32 +110,36 @@ class _Problem:
     limits: Limits
     parameters: tuple[str, ...]
     noise: float
+    joint: int = 0
 
 
 def design_excitation(
     plant: PlantParameters,
     limits: Limits,
     *,
-    parameters: Sequence[str] = ("inertia", "damping", "gravity", "coulomb_friction"),
+    parameters: Sequence[str] = (),
     kinds: Sequence[str] = KINDS,
     duration: float = 20.0,
     period: float = 0.01,
     noise: float = 1e-3,
     seed: int = 0,
     trials: int = 60,
+    joint: str = "",
 ) -> Excitation:
     """Return the best excitation found; a function of its arguments alone.
 
     Args:
         plant: Prior guess of the plant, rigid.
         limits: Of torque, speed and angle.
-        parameters: What to learn.
+        parameters: What to learn; none for inertia, damping, gravity and Coulomb friction, or of several joints for
+            what their motion can tell apart and friction that is not 0.
         kinds: Signals to consider.
         duration: [s].
         period: Torque is held that long, and the angle sampled so often [s].
-        noise: Standard deviation of the angle sensor [rad].
+        noise: Standard deviation of the position sensors [rad or m].
         seed: Of the random search.
         trials: Candidates over all kinds; as many again improve the best.
+        joint: Driven joint of several that is excited; by default the first.
 
     Raises:
         DataError: for unknown kinds or parameters, or a duration shorter than 50 samples.
@@ -123,19 +147,31 @@ def design_excitation(
     for kind in kinds:
         if kind not in KINDS:
             raise DataError(f"kind is {kind!r}; expected one of {', '.join(KINDS)}, or best")
+    if plant.is_pendulum:
+        known, usual = [name for name in BOUNDS if name != "input_gain"], _OF_ONE
+    else:
+        known = [*MechanismModel.of(plant).fitted()]
+        usual = tuple(name for name in known if not name.endswith(_FRICTION) or plant.value(name) > 0.0)
+    parameters = tuple(parameters) or usual
     for name in parameters:
-        if name not in BOUNDS or name == "input_gain":
-            raise DataError(
-                f"parameter is {name!r}; expected some of {', '.join(n for n in BOUNDS if n != 'input_gain')}"
-            )
-    if not parameters or not kinds:
-        raise DataError("parameters or kinds is empty; expected at least one of each")
+        if name not in known:
+            raise DataError(f"parameter is {name!r}; expected some of {', '.join(known)}")
+    driven = plant.coordinates.driven_names
+    if not driven or (joint and joint not in driven):
+        raise DataError(f"joint is {joint or 'none'}; expected one that is driven: {', '.join(driven) or 'none is'}")
+    if not kinds:
+        raise DataError("kinds is empty; expected at least one")
     if not (period > 0.0 and duration >= 50.0 * period):
         raise DataError(f"duration is {duration} s at a period of {period} s; expected at least 50 periods")
     if not noise > 0.0:
         raise DataError(f"noise is {noise} rad; expected > 0")
     problem = _Problem(
-        plant, np.arange(round(duration / period), dtype=np.float64) * period, limits, tuple(parameters), noise
+        plant,
+        np.arange(round(duration / period), dtype=np.float64) * period,
+        limits,
+        tuple(parameters),
+        noise,
+        plant.coordinates.driven[driven.index(joint) if joint else 0],
     )
     rng = np.random.default_rng(seed)
     best: tuple[Excitation, Array] | None = None
@@ -173,8 +209,7 @@ def _evaluate(problem: _Problem, kind: str, genes: Array) -> Excitation | None:
 def _shape(kind: str, time: Array, genes: Array, plant: PlantParameters) -> Array:
     """Return a signal of peak 1 from numbers in [0, 1)."""
     duration = float(time[-1] - time[0])
-    own = np.sqrt(max(plant.gravity, 1e-9) / plant.inertia) / (2.0 * np.pi)
-    rate = plant.damping / plant.inertia / (2.0 * np.pi)
+    own, rate = _rates(plant)
     # Up to above resonance, or to the corner of an overdamped plant, but not where nothing answers.
     top = float(np.clip((1.0 + 4.0 * genes[0]) * max(own, min(rate, 2.0), 0.2), 0.5, 0.2 / (time[1] - time[0])))
     bottom = max(1.0 / duration, 0.1 * own * (0.2 + genes[1]))
@@ -196,7 +231,18 @@ def _shape(kind: str, time: Array, genes: Array, plant: PlantParameters) -> Arra
     return np.asarray(signal * edge / max(peak, 1e-12))
 
 
+def _rates(plant: PlantParameters) -> tuple[float, float]:
+    """Return the fastest frequency of free swings about hanging, and the fastest decay [Hz]."""
+    if plant.is_pendulum:
+        own = np.sqrt(max(plant.gravity, 1e-9) / plant.inertia) / (2.0 * np.pi)
+        return float(own), plant.damping / plant.inertia / (2.0 * np.pi)
+    poles = linearise(plant, (0.0,) * len(plant.joints)).poles / (2.0 * np.pi)
+    return max(float(np.max(np.abs(poles.imag))), 1e-5), float(np.max(-poles.real, initial=0.0))
+
+
 def _motion(problem: _Problem, effort: Array) -> tuple[Array, Array]:
+    if not problem.plant.is_pendulum:
+        return _joint_motion(problem, effort)
     recording = Recording(problem.time, np.zeros_like(problem.time), None, effort, hold="zero")
     piece = replace(prepare(recording, None), states=np.zeros((1, 2)))
     result = simulate(from_plant(problem.plant), piece)
@@ -214,25 +260,100 @@ def _windowed(problem: _Problem, effort: Array, theta: Array, omega: Array, free
     return np.concatenate([without(part[:, -2:], part[:, :-2]) for part in parts])
 
 
+def _joint_model(plant: PlantParameters) -> MechanismModel:
+    lags = [actuator.time_constant for actuator in plant.actuators]
+    return MechanismModel.of(plant).with_changes({DELAY: common_delay(plant), LAG: lags[0]})
+
+
+def _joint_windows(problem: _Problem, effort: Array, position: Array, window: float) -> Windows:
+    efforts = np.zeros_like(position)
+    efforts[:, problem.joint] = effort
+    time = problem.time
+    recording = JointRecording("the excitation", time, position, efforts, ("zero",) * position.shape[1])
+    return prepare_windows(recording, window)
+
+
+def _joint_motion(problem: _Problem, effort: Array) -> tuple[Array, Array]:
+    """Return positions and velocities (n, joints) of several joints that hang at first."""
+    time, n = problem.time, len(problem.plant.joints)
+    # All of it is one window, which begins a little after the recording: both begin at rest.
+    lead = time[1] * np.arange(-_LEAD, 0)
+    whole = replace(problem, time=np.concatenate([lead, time]) - lead[0])
+    padded = np.concatenate([np.zeros(_LEAD), effort])
+    data = _joint_windows(whole, padded, np.zeros((whole.time.size, n)), float(whole.time[-1]) + 1.0)
+    at = np.zeros((1, 1, 2 * n))
+    path = _joint_path(_joint_model(problem.plant), data, at)[0, 0][data.inside[0]]
+    first = path.shape[0] - time.size
+    return path[first:, :n], path[first:, n:]
+
+
+def _joint_path(model: MechanismModel, data: Windows, states: Array, values: Array | None = None) -> Array:
+    """Return motions (c, w, l, 2 n) of values (c, parameters), by default the model's, from states (c, w, 2 n)."""
+    values = model.vector[None] if values is None else values
+    drive = data.input(model[DELAY], model[LAG])[None]
+    path = np.empty((len(values), *data.time.shape, states.shape[-1]))
+    run, steps = motion_kernel(model.plant.mechanism.name), np.diff(data.time, axis=1)
+    which = np.zeros(len(values), dtype=np.int64)
+    run(*model.tables(values), drive, which, steps, np.ascontiguousarray(states), path)
+    return path
+
+
+def _joint_windowed(problem: _Problem, effort: Array, position: Array, velocity: Array, names: Sequence[str]) -> Array:
+    """Return the sensitivities of the positions as a fit sees them, as :func:`_windowed` does."""
+    model, n = _joint_model(problem.plant), position.shape[1]
+    # As long as those of a fit, which are a sixth of the data.
+    data = _joint_windows(problem, effort, position, float(np.clip(problem.time[-1] / 6.0, 0.5, 5.0)))
+    first = np.searchsorted(problem.time, data.time[:, 0] - 1e-9)
+    states = np.concatenate([position[first], velocity[first]], axis=1)
+    index = model.index(names)
+    steps = np.array([*(_STEP * model.size(name) for name in names), *[_STEP] * (2 * n)])
+    values, starts = np.tile(model.vector, (steps.size, 1)), np.tile(states, (steps.size, 1, 1))
+    for c, step in enumerate(steps):
+        if c < len(index):
+            values[c, index[c]] += step
+        else:
+            starts[c, :, c - len(index)] += step
+    moved = _joint_path(model, data, starts, values) - _joint_path(model, data, states[None])
+    slopes = np.moveaxis(moved[..., :n] / steps[:, None, None, None], 0, -1)
+    parts = [rows[inside].reshape(-1, steps.size) for rows, inside in zip(slopes, data.inside, strict=True)]
+    return np.concatenate([without(part[:, len(index) :], part[:, : len(index)]) for part in parts])
+
+
 def _keeps(problem: _Problem, shape: Array) -> bool:
     theta, omega = _motion(problem, problem.limits.effort * shape)
-    return bool(np.max(np.abs(theta)) <= problem.limits.angle and np.max(np.abs(omega)) <= problem.limits.speed)
+    if theta.ndim == 1:
+        within = np.abs(theta) <= problem.limits.angle
+    else:
+        slides = np.array([joint.unit == "m" for joint in problem.plant.coordinates.joints])
+        # A slide coasts on when the effort has ended, while the recording does.
+        after = theta[-1:] + _COASTING * omega[-1:] * slides
+        within = np.abs(np.concatenate([theta, after])) <= problem.limits.of(problem.plant)
+    return bool(np.all(within) and np.max(np.abs(omega)) <= problem.limits.speed)
 
 
 def _judge(problem: _Problem, kind: str, shape: Array) -> Excitation:
-    effort = problem.limits.effort * shape
-    others = [n for n in ("inertia", "damping", "gravity", "coulomb_friction") if n not in problem.parameters]
-    names = [*problem.parameters, *others, *(n for n in NUISANCE if n not in problem.parameters)]
+    effort, plant = problem.limits.effort * shape, problem.plant
     theta, omega = _motion(problem, effort)
-    jacobian = _windowed(problem, effort, theta, omega, [INDEX[name] for name in names])
+    if plant.is_pendulum:
+        others = [n for n in _OF_ONE if n not in problem.parameters]
+        names = [*problem.parameters, *others, *(n for n in NUISANCE if n not in problem.parameters)]
+        jacobian = _windowed(problem, effort, theta, omega, [INDEX[name] for name in names])
+    else:
+        model = MechanismModel.of(plant)
+        offsets = [name for group in model.own_offsets for name in group]
+        names = [*dict.fromkeys((*problem.parameters, *model.fitted(), *offsets))]
+        jacobian = _joint_windowed(problem, effort, theta, omega, names)
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
     singular = np.linalg.svd(jacobian / scale, full_matrices=False)
     inverse = (singular[2].T / np.maximum(singular[1], 1e-9) ** 2) @ singular[2]
     error = problem.noise * np.sqrt(np.diag(inverse)) / scale
     predicted = {name: 1.96 * float(error[i]) for i, name in enumerate(problem.parameters)}
-    model = from_plant(problem.plant)
-    # A parameter that is 0 in the prior has no relative error: take its share of gravity instead.
-    size = {n: abs(model[n]) or 0.05 * max(problem.plant.gravity, 1e-3) for n in problem.parameters}
+    if plant.is_pendulum:
+        own = from_plant(plant)
+        # A parameter that is 0 in the prior has no relative error: take its share of gravity instead.
+        size = {n: abs(own[n]) or 0.05 * max(plant.gravity, 1e-3) for n in problem.parameters}
+    else:
+        size = {n: MechanismModel.of(plant).size(n) for n in problem.parameters}
     relative = {name: predicted[name] / size[name] for name in problem.parameters}
     score = float(np.mean([np.log(max(value, 1e-12)) for value in relative.values()]))
     return Excitation(kind, problem.time, effort, theta, omega, predicted, relative, score)
