@@ -156,7 +156,7 @@ def joints(
     if running := [settings.namespace(side) for side in SIDES if settings.running(side) is not None]:
         if domain is None:
             raise ParameterError(f"plant {running[0]} runs on a ROS domain; expected --domain N, or ROS_DOMAIN_ID")
-        unit = next(each.effort_unit for each in simulated.mechanism.joints if each.name == settings.joint)
+        unit = simulated.coordinates.drive_unit
         plan = (
             f"It waits until you hold the plant upright and still, arms, and balances it: release it within "
             f"{RELEASE_TIME:g} s. Then noise of up to {amplitude:g} {unit} acts at {settings.joint} for "

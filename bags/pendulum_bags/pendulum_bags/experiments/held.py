@@ -65,7 +65,7 @@ def record_held(
         session.drives(plant)
         plant.wait_until_ready(START_TIMEOUT)
         RecorderClient(session.orchestrator, space).wait_until_heard(
-            [f"{space}/{topic}" for topic in names.SIGNALS], START_TIMEOUT
+            [f"{space}/{topic}" for topic in (names.JOINT_STATES, *design.coordinates.topics)], START_TIMEOUT
         )
         plant.configure_controller()
         progress.phase("waiting until it is held upright", 10.0)

@@ -160,7 +160,7 @@ def recorded_difference(bag: Path, namespace: str, plant: str) -> str:
     parameters = load_mechanism(plant)
     with read_bag(bag) as opened:
         states = opened.joints(f"{namespace}/{names.JOINT_STATES}")
-        efforts = opened.joints(f"{namespace}/{names.APPLIED_EFFORT}")
+        efforts = opened.joints(f"{namespace}/{parameters.coordinates.topics.applied}")
         marks = {event["name"]: int(event["stamp_ns"]) for event in opened.events()}
     stamps = states.stamp_ns
     begin, end = int(stamps[0]), int(stamps[-1])

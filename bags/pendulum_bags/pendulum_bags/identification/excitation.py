@@ -147,6 +147,8 @@ def design_excitation(
     for kind in kinds:
         if kind not in KINDS:
             raise DataError(f"kind is {kind!r}; expected one of {', '.join(KINDS)}, or best")
+    if plant.coordinates.volts:
+        raise DataError(f"plant {plant.name!r} is driven in volts; expected one that is driven by an effort")
     if plant.is_pendulum:
         known, usual = [name for name in BOUNDS if name != "input_gain"], _OF_ONE
     else:
