@@ -156,18 +156,11 @@ def minimise(
     tolerance: float,
     hopeless: float = np.inf,
 ) -> Solution[M]:
-    """Minimise the loss of all recordings over free parameters and window states.
+    """Minimise the loss of all recordings over free parameters and window states, shape (w, x) by recording.
 
-    Args:
-        model: Start.
-        motions: By recording.
-        states: Start of the window states, by recording, shape (w, x).
-        free: Names of the parameters to fit; none fits the window states alone.
-        own: Names of parameters of which each recording has a value of its own; none of them is in ``free``.
-        offsets: Start of those values, shape (recordings, m); by default the model's.
-        max_iterations: Most steps to try.
-        tolerance: Relative decrease of the loss below which the search has converged.
-        hopeless: Loss above which the search ends as soon as it makes little progress.
+    Each recording has values of its own of the parameters ``own``, which are not in ``free``, and which begin at
+    ``offsets``, shape (recordings, m), or the model's. The search ends after ``max_iterations``, where a step lowers
+    the loss by less than a share ``tolerance``, or where a loss above ``hopeless`` makes little progress.
     """
     k, m, count = len(free), len(own), len(motions)
     names = (*free, *(name for _ in motions for name in own))
@@ -276,12 +269,7 @@ def _damped_step(
 def bounded_step(system: Array, gradient: Array, values: Array, low: Array, high: Array) -> Array:
     """Return the step of a quadratic model within bounds: what would leave them stops there, the others solve again.
 
-    Args:
-        system: Damped matrix, shape (k, k).
-        gradient: Half of the cost's derivative, shape (k,).
-        values: Where the step begins, shape (k,).
-        low: Lower bounds, shape (k,).
-        high: Upper bounds.
+    All but the damped matrix ``system``, shape (k, k), have the shape (k,); ``gradient`` is half of the derivative.
     """
     step = np.linalg.solve(system, -gradient)
     active = np.zeros(step.size, dtype=bool)

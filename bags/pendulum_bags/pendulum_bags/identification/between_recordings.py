@@ -23,13 +23,7 @@ _MANY = 1e6
 
 @dataclass(frozen=True)
 class Alone:
-    """One recording, fitted without the others.
-
-    Args:
-        name: Of the recording.
-        values: By parameter.
-        errors: Their standard errors, of those that have one.
-    """
+    """One recording, fitted without the others: values, and standard errors of those that have one, by parameter."""
 
     name: str
     values: Mapping[str, float]
@@ -39,10 +33,7 @@ class Alone:
 def excluding(alone: Sequence[Alone], ratios: Mapping[str, float], unit: Callable[[str], str]) -> str | None:
     """Return that two recordings exclude each other: they are of two machines, or of one with two loads.
 
-    Args:
-        alone: The recordings.
-        ratios: By parameter, up to which what differs may be one machine's: what the model lacks moves it.
-        unit: Of a parameter.
+    Up to the ``ratios`` of its parameters, what differs may be one machine's: what the model lacks moves it.
     """
     for name, ratio in ratios.items():
         rows = [
@@ -70,12 +61,6 @@ def half_width(name: str, alone: Sequence[Alone], error: float, freedom: float) 
     recordings. It is the most that differs with a confidence of 75 %: where three recordings happen to agree, an
     estimate would be 0. Means of 20 000 draws lie within it in 97 to 98 % where nothing differs, in 94 to 95 % where
     that is as large as the recordings' errors, and at 5 times them in 93 % of three recordings. Two are too few.
-
-    Args:
-        name: Of the parameter.
-        alone: The recordings.
-        error: Standard error of the common fit.
-        freedom: Its degrees of freedom.
 
     Source:
         DerSimonian and Laird, Controlled Clinical Trials 7, 1986, and Viechtbauer, Statistics in Medicine 26, 2007 (the

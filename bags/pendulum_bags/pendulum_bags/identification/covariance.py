@@ -32,7 +32,7 @@ FREQUENCY = "natural_frequency"
 
 @dataclass(frozen=True)
 class Errors:
-    """Standard errors of one candidate.
+    """Standard errors of one fit.
 
     Args:
         names: Parameters with an error, order of the matrices.
@@ -110,15 +110,9 @@ def standard_errors(
 ) -> Errors:
     """Return the standard errors of parameters: the largest of those of white and of correlated residuals.
 
-    Args:
-        seen: Sensitivities and residuals.
-        model: The fit; what it knows beforehand counts as measured.
-        names: Parameters.
-        freedom: Measurements less what was fitted.
-        size: Scale of each parameter, for the condition number; by default its own error, were the others known.
-        scale: Of the robust loss.
-        serial: Whether to allow for residuals that are correlated within a window.
-        clusters: Whether to allow for what the residuals of a window have in common.
+    What the model knows beforehand counts as measured. ``freedom`` is the number of measurements less that of what was
+    fitted; ``size`` scales the parameters for the condition number, by default by their errors, were the others known;
+    ``serial`` allows for residuals that are correlated within a window, ``clusters`` for what those of a window share.
 
     Source:
         Huber, Robust Statistics, sec. 7.6; Newey and West, Econometrica 55, 1987; Liang and Zeger, Biometrika 73, 1986.
@@ -228,7 +222,6 @@ def _frequency_gradient(model: FitModel, names: Sequence[str]) -> Array | None:
 
 
 def _influence(residual: Array, scale: float) -> tuple[Array, Array]:
-    """Return psi(r), the derivative of the loss, and psi'(r)."""
     if not np.isfinite(scale):
         return residual, np.ones_like(residual)
     root = np.sqrt(1.0 + (residual / scale) ** 2)
@@ -241,11 +234,7 @@ def least_scale(name: str) -> float:
 
 
 def _jackknife(candidate: Candidate, of: Callable[[Array], Array]) -> Array:
-    """Return the standard error that the fits without one fold show of a function of the parameter vector, shape (k,).
-
-    Source:
-        Efron and Tibshirani, An Introduction to the Bootstrap, 1993, ch. 11.
-    """
+    """Return the standard error that the fits without one fold show of a function of the parameters (Efron, ch. 11)."""
     validation = candidate.validation
     vectors = () if validation is None else validation.vectors
     if len(vectors) < 2:

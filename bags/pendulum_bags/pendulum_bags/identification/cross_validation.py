@@ -56,11 +56,10 @@ def folds(pieces: Sequence[Piece], count: int = 6) -> list[list[NDArray[np.int64
 def _refit(
     model: FitModel, train: Sequence[Piece], states: Sequence[Array], free: Sequence[str], scale: float
 ) -> FitModel:
-    """Return the model fitted to the training part, from the fit on all data and, where that holds it, from others.
+    """Return the model fitted to the training part.
 
-    The cost has kinks (a reversal, a standstill): a search that begins on one may find no way off it, and would then
-    hand back what it has learnt from the held-out part. Beside a start that did not get away, others are tried, whose
-    torques or whose friction are scaled: those are the directions that recordings leave open.
+    The cost has kinks (a reversal, a standstill), and a search that begins on one may keep what it has learnt from the
+    held-out part: a start that did not get away is joined by others along the directions that recordings leave open.
     """
 
     def search(start: FitModel) -> Solution:

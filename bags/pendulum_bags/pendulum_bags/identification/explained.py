@@ -71,10 +71,7 @@ class Explained:
 def explained(fit: OutputErrorFit, outliers: Sequence[tuple[str, float, float, float]] = ()) -> Explained:
     """Return how much of the motion a fit explains, and refuse it where that is next to nothing.
 
-    Args:
-        fit: The fit.
-        outliers: Windows that stand out, as :class:`ResidualTests` names them: a hand in a few of them is no fault of
-            the model, as long as they are few.
+    A hand in a few windows, the ``outliers`` of :class:`ResidualTests`, is no fault of the model.
     """
     parts = residuals(fit.model, fit.pieces, fit.chosen.solution.states)
     errors, lines = errors_by_window(parts, fit.pieces)

@@ -33,13 +33,7 @@ class GeometryCheck:
 
 
 def check_geometry(model: FitModel, uncertainty: Uncertainty, geometry: Geometry) -> GeometryCheck | None:
-    """Compare gravity with m g l, inertia with the known one or its least, m l^2, and their ratio w0.
-
-    Args:
-        model: The fit.
-        uncertainty: Its intervals.
-        geometry: What is known; None is returned where that is nothing.
-    """
+    """Compare gravity with m g l, inertia with the known one or its least, m l^2, and w0; None where none is known."""
     normalised = model.input_kind in {"voltage", "none"} and "inertia" not in uncertainty.intervals
     rows: list[tuple[str, str, float, float, float, float, bool]] = []
     said: list[str] = []

@@ -43,11 +43,8 @@ def identify(
 ) -> PendulumResult:
     """Identify a pendulum by output error and judge the result.
 
-    Args:
-        recordings: Data to fit; all of one pendulum, with one kind of input.
-        options: Choices; the defaults serve unseen data.
-        held_out: Recordings to score only.
-        profiles: For how many weak parameters to compute profile intervals.
+    The recordings are of one pendulum with one kind of input, those held out are scored only, and ``profiles`` weak
+    parameters get profile intervals.
     """
     check_distinct(recordings, held_out)
     if recordings and all(r.input_kind == "effort" and not np.any(r.input) for r in recordings):
@@ -107,7 +104,6 @@ def identify(
 
 
 def _alone(fit: OutputErrorFit) -> list[Alone]:
-    """Return what each recording of several says alone."""
     if len(fit.pieces) < 2 or fit.reading is not None:
         return []
     chosen, found = fit.chosen, []

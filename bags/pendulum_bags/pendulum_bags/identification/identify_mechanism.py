@@ -87,13 +87,13 @@ def identify_mechanism(
     """Identify a mechanism by output error and judge the result.
 
     Args:
-        plant: Start, and what is held: lengths, gears, gravity, masses that the motion cannot tell.
+        plant: Start, and what is held: lengths, gears, gravity, masses that the motion does not determine.
         recordings: Data to fit, all of one machine.
         held_out: Recordings to score only.
         window: Length of the windows [s]; by default a sixth of the data, between 0.5 and 5 s, or what
             neighbouring motions stay together for.
         extras: One of ``EXTRAS``; None lets held-out windows choose.
-        stride: Take every n-th position, n being this.
+        stride: Take every n-th position.
 
     Raises:
         DataError: A recording is too short, of other joints, or one joint of it does not move.
@@ -175,7 +175,6 @@ def identify_mechanism(
 
 
 def _notes(recordings: Sequence[JointRecording], pushed: Sequence[tuple[str, float, float]]) -> list[str]:
-    """Return what was left out of the recordings, and what acts where the plant has no actuator."""
     notes = [
         f"{r.name}: {r.left_out} rows with a NaN or a repeated stamp are left out." for r in recordings if r.left_out
     ]
@@ -194,8 +193,6 @@ def _notes(recordings: Sequence[JointRecording], pushed: Sequence[tuple[str, flo
 
 @dataclass(frozen=True)
 class _Attempt:
-    """A fit, its extras, the held-out errors of all that were tried, and the length of its windows [s]."""
-
     fit: MechanismFit
     extras: str
     candidates: dict[str, float]
@@ -247,10 +244,7 @@ class _Search:
         return best
 
     def _late(self, start: MechanismModel, data: list[Windows]) -> MechanismModel | None:
-        """Return the start with the delay that explains most; None where that is its own.
-
-        A search from far below the delay ends in a poor minimum.
-        """
+        """Return the start with the delay that explains most; None where that is its own."""
         weights, costs = first_weights(data), dict[float, float]()
         models = dict[float, MechanismModel]()
         for delay in dict.fromkeys((start[DELAY], *_DELAYS)):
@@ -278,10 +272,7 @@ class _Search:
 
 
 def _without_pushes(found: MechanismFit) -> tuple[MechanismFit, list[tuple[str, float, float]]]:
-    """Return the fit, and the windows left out since something else moves the machine there.
-
-    Left out is what makes the difference: without a few windows the fit has to explain the rest.
-    """
+    """Return the fit without the windows whose absence lets it explain the rest, and those windows."""
     total = sum(len(part.time) for part in found.data)
     share = found.worst
     if share <= DOUBTFUL_SHARE or total < 8:
@@ -364,7 +355,6 @@ def _uncertainty(found: MechanismFit, held: Sequence[str] = (), alone: Sequence[
 
 
 def _errors(found: MechanismFit) -> Errors:
-    """Return the larger error of white residuals and of windows as clusters, as they are coloured."""
     measured = sum(part.samples for part in found.data) * np.count_nonzero(found.weights)
     fitted = sum(states.size for states in found.states) + len(found.free) + found.offsets.size
     return standard_errors(
@@ -377,7 +367,6 @@ def _freedom(found: MechanismFit) -> float:
 
 
 def _alone(found: MechanismFit, weights: Array) -> list[Alone]:
-    """Return what each recording of several says alone."""
     rows = []
     names = distinct_names([part.recording for part in found.data])
     for i, (name, part) in enumerate(zip(names, found.data, strict=True)):

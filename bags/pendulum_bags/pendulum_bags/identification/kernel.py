@@ -131,7 +131,7 @@ def simulate_windows(
     """Simulate each window from its own initial state; write theta, omega and d theta / d(parameters, state).
 
     Args:
-        p: Parameter vector in the order of ``PARAMETER_NAMES``, shape (14 and those of further friction terms,).
+        p: Parameter vector in the order of ``PARAMETER_NAMES``.
         columns: Indices of the parameters to differentiate, shape (k,), int64.
         windows: First and one past last sample of each window, shape (w, 2), int64.
         states: Initial angle [rad] and velocity [rad/s] of each window, shape (w, 2).
@@ -321,18 +321,9 @@ def normal_blocks(
     g_p: Array,
     g_x: Array,
 ) -> None:
-    """Accumulate the arrowhead normal equations of one recording (parameters p, initial states x by window).
+    """Add the normal equations of one recording to the blocks of :class:`~arrowhead.Blocks`.
 
-    Args:
-        jacobian: Sensitivities, shape (n, k + 2).
-        residual: Simulated minus measured, shape (n,).
-        weight: Of each sample, shape (n,).
-        windows: First and one past last sample of each window, shape (w, 2).
-        h_pp: Added to: parameters with parameters, shape (k, k).
-        h_px: Added to: parameters with states, shape (w, k, 2).
-        h_xx: Added to: states with states, shape (w, 2, 2).
-        g_p: Added to: gradient of the parameters, shape (k,).
-        g_x: Added to: gradient of the states, shape (w, 2).
+    Sensitivities have the shape (n, k + 2), residuals and weights (n,), windows (w, 2).
     """
     k = g_p.size
     for n in range(windows.shape[0]):

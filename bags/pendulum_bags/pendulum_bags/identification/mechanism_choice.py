@@ -36,16 +36,9 @@ _WORTH = 0.98
 def choose(
     start: MechanismModel, data: Sequence[Windows], weights: Array, extras: str | None
 ) -> tuple[MechanismFit, str, dict[str, float]]:
-    """Return the fit that predicts what it has not seen best; each further parameter must be worth it.
+    """Return the fit that predicts best what it has not seen, which candidate it is, and the held-out error of each.
 
-    Args:
-        start: The model to start from.
-        data: Windows of the recordings.
-        weights: As :func:`~pendulum_bags.identification.mechanism_fit.first_weights` has them.
-        extras: The one candidate of ``EXTRAS`` to fit; None to choose.
-
-    Returns:
-        The fit, which candidate it is, and the held-out error of each.
+    Each further parameter must be worth it. ``extras`` is the one candidate of ``EXTRAS`` to fit; None to choose.
 
     Raises:
         DataError: There is no such candidate.

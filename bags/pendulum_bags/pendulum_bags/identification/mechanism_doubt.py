@@ -193,5 +193,4 @@ def _fits(plant: PlantParameters, reading: _Reading, data: Sequence[Windows]) ->
 
 
 def _share(found: MechanismFit) -> float:
-    """Return the mean share that a fit misses, inf where it ended far from the start."""
     return math.inf if far_off(found) is not None else float(np.mean([score.share for score in found.scores]))

@@ -167,7 +167,6 @@ def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1
 
 
 def _area(recording: JointRecording) -> Array:
-    """Return the integral of the effort up to each sample, shape (s, n)."""
     columns = zip(recording.effort.T, recording.hold, strict=True)
     time = recording.time
     return np.stack([cumulative_input(time, np.array(u), hold == "linear") for u, hold in columns], axis=1)
@@ -207,9 +206,7 @@ class Score:
     def shares(self, least: Array | float = 1e-12) -> Array:
         """Return the error beyond the sensors' noise over that of straight lines, by joint, shape (n,).
 
-        Args:
-            least: Below which straight lines count as missing nothing, by joint: a joint that hardly moves shows
-                its noise alone [rad or m].
+        Below ``least`` [rad or m] straight lines count as missing nothing: a joint that hardly moves shows noise.
         """
         left = np.sqrt(np.maximum(self.rms**2 - np.square(self.noise), 0.0))
         return np.asarray(left / np.maximum(self.lines, least))
@@ -384,19 +381,14 @@ def fit(
     tolerance: float = 1e-6,
     hopeless: float = np.inf,
 ) -> MechanismFit:
-    """Minimise the weighted squares of the errors over free parameters and start states.
+    """Minimise the weighted squares of the errors over free parameters and start states, as :func:`minimise` does.
 
-    Args:
-        model: Start.
-        data: Windows of each recording.
-        free: Names of what to fit; none fits the start states alone.
-        weights: Of each joint's error, shape (n,), or of its position and its velocity, shape (2 n,).
-        own: Names of offsets of which each recording has a value of its own; none of them is in ``free``.
-        states: Start of the start states; by default the windows' first guesses.
-        offsets: Start of the own offsets, shape (recordings, m); by default the model's.
-        most: Most steps to try.
-        tolerance: Relative decrease of the cost below which the fit ends.
-        hopeless: Weighted rms error above which the fit ends as soon as it makes little progress: it is refused anyway.
+    ``weights`` are of each joint's error, shape (n,), or of its position and its velocity, shape (2 n,); the start
+    states begin at the windows' first guesses. A fit whose weighted rms error is above ``hopeless`` is refused anyway,
+    and ends as soon as it makes little progress.
+
+    Raises:
+        DataError: The start's motion leaves all bounds.
     """
     count = len(model.plant.joints)
     weights = np.concatenate((weights, np.zeros(count))) if weights.size == count else weights
@@ -436,8 +428,7 @@ def window_length(model: MechanismModel, recordings: Sequence[JointRecording], l
 
     Along the measured motion the equation, linearised and without dry friction (which hides an unstable equilibrium as
     long as a joint rests), carries a small difference on. Where it grows by more than a factor of 30 (3 where
-    velocities were measured) the start of a window does not determine its end, and a fit to it has many minima: chaotic
-    motion, and motion about an unstable equilibrium.
+    velocities were measured) a fit has many minima: chaotic motion, and motion about an unstable equilibrium.
     """
     n, lengths = len(model.plant.joints), []
     smooth = model.with_changes({f"{joint}.coulomb_friction": 0.0 for joint in model.plant.coordinates.names}).vector

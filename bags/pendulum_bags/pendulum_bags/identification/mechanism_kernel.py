@@ -27,13 +27,9 @@ _BREAKAWAY = 2e-5
 
 @numba.njit(cache=True)
 def lagged(effort: Array, rise: Array, steps: Array, lag: float) -> Array:
-    """Return a first-order lag of an input of straight pieces at each stamp, at rest before, shape (s, n).
+    """Return a first-order lag > 0 [s] of an input of straight pieces at each stamp, at rest before, shape (s, n).
 
-    Args:
-        effort: At the start of each piece, shape (s, n).
-        rise: Its slope in each piece, shape (s - 1, n).
-        steps: Lengths of the pieces, shape (s - 1,) [s].
-        lag: Time constant, > 0 [s].
+    The pieces have starts, shape (s, n), slopes (s - 1, n) and lengths (s - 1,) [s].
     """
     found = effort.copy()
     for k in range(steps.size):

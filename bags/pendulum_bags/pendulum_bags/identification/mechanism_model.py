@@ -169,11 +169,7 @@ class MechanismModel:
         return plant.with_values(changes)
 
     def tables(self, values: Array) -> tuple[Array, Array, Array, Array]:
-        """Return what :func:`~pendulum_bags.identification.mechanism_kernel.motion_kernel` takes of c sets of values.
-
-        Args:
-            values: Shape (c, parameters).
-        """
+        """Return the arguments of :func:`motion_kernel` for c sets of values, shape (c, parameters)."""
         n, own = len(self.plant.joints), len(self.plant.mechanism.parameter_names)
         friction, offset, zero = (values[:, own + i * n : own + (i + 1) * n] for i in range(3))
         table = np.tile(np.array(pack_joints(self.plant)), (len(values), 1, 1))

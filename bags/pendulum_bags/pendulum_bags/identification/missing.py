@@ -20,15 +20,10 @@ _LEVEL = 0.01
 def missing_torques(model: FitModel, pieces: Sequence[Piece], parts: Sequence[Array]) -> list[str]:
     """Return in words the torques that the residuals show, such as drag by the square of speed; none for noise.
 
-    To first order a residual r obeys J r'' + b r' + G cos(th) r = (missing torque). Its left side comes from the same
-    modulating functions as the starts, so that nothing is differentiated. It is regressed on torques that a pendulum
-    may have and the candidates have not, beside those that they have; sums over blocks longer than the filter judge
-    them, at 1 % over all. Noise of the sensor and torques that have nothing to do with the motion show none.
-
-    Args:
-        model: The fit.
-        pieces: Its data.
-        parts: Residuals of each piece, simulated minus measured, shape (n,) [rad].
+    To first order a residual r, simulated minus measured [rad], obeys J r'' + b r' + G cos(th) r = (missing torque).
+    Its left side comes from the same modulating functions as the starts. It is regressed on torques that a pendulum may
+    have and the candidates have not, next to those that they have; sums over blocks longer than the filter judge them,
+    at 1 % over all. Noise of the sensor and torques that have nothing to do with the motion show none.
 
     Source:
         Engle, Wald, likelihood ratio, and Lagrange multiplier tests in econometrics, Handbook of Econometrics 2, 1984

@@ -60,13 +60,7 @@ def open_sentences(
 ) -> list[str]:
     """Return what the recordings leave open, in words.
 
-    Args:
-        intervals: By parameter.
-        names: Order of the matrix.
-        correlation: shape (k, k).
-        condition: Condition number of the information matrix.
-        weakest: Direction that the data see least, shape (k,).
-        delay: Name of the delay.
+    ``correlation``, shape (k, k), is of the parameters ``names``, as is ``weakest``, the direction seen least.
     """
     said = []
     late = intervals.get(delay)
@@ -130,7 +124,7 @@ def scale_sentences(intervals: Mapping[str, Interval], names: Sequence[str], fit
 def edge_sentences(intervals: Mapping[str, Interval], fit: OutputErrorFit, unresolved: str | None = None) -> list[str]:
     """Return which parameters of a pendulum ended at the edge of their domain, and which offset stands for two.
 
-    ``unresolved`` is an offset that was left out, though it would have done as well as the one that was kept.
+    ``unresolved`` is an offset that was left out, though it would have done as well as the one in the fit.
     """
     said = []
     edges = [_edge(name, fit, intervals) for name in at_bounds(fit.chosen)]

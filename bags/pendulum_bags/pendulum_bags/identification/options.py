@@ -88,15 +88,11 @@ DEFAULTS = Options()
 
 
 def default_window(input_kind: str, seconds: float) -> float | None:
-    """Return the length of the shooting windows [s], None for whole recordings.
+    """Return the length of the shooting windows [s] by input and duration [s]; None for whole recordings.
 
     Long windows show slow errors (offsets, drag), short ones keep a simulation near the truth from which friction and
     a wrong start carry it away. A torque gets 1 s. A voltage, whose back-EMF damps what is wrong at first, gets 5 s
     where there are twelve of them, and not less than 2 s. The position loop of a servo keeps all of a recording near.
-
-    Args:
-        input_kind: One of ``datasets.INPUT_KINDS``.
-        seconds: Duration of all recordings together [s].
     """
     if input_kind == "voltage":
         return min(max(seconds / 12.0, 2.0), 5.0)

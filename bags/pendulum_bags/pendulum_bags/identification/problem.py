@@ -78,12 +78,7 @@ class Simulation:
 
 
 def cut_windows(time: Array, window: float | None) -> NDArray[np.int64]:
-    """Return windows that follow one another, shape (w, 2); a rest of at least half a window counts as one.
-
-    Args:
-        time: Sample stamps, shape (n,) [s].
-        window: Length [s]; None or longer than the recording gives one window.
-    """
+    """Return windows that follow one another, shape (w, 2), None for one; a rest of half a window counts as one."""
     if window is not None and not window > 0.0:
         raise DataError(f"window is {window} s; expected > 0")
     span = float(time[-1] - time[0])
@@ -205,17 +200,10 @@ def simulate(
     free: Sequence[int] | None = None,
     step: float | None = None,
 ) -> Simulation:
-    """Simulate every window of a piece.
+    """Simulate every window of a piece; samples outside the windows are NaN.
 
-    Args:
-        model: Parameters.
-        piece: Data and windows.
-        states: Initial states, shape (w, 2); by default the first guesses.
-        free: Indices of parameters to differentiate; None for no derivatives.
-        step: Longest integration step [s]; by default :func:`longest_step`.
-
-    Returns:
-        The simulation; samples outside the windows are NaN.
+    States, shape (w, 2), are by default the first guesses; ``free`` are indices of parameters to differentiate; the
+    integration steps are at most ``step`` long [s].
     """
     recording = piece.recording
     if recording.input_kind not in (model.input_kind, "none"):

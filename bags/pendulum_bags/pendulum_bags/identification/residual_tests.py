@@ -61,14 +61,10 @@ class ResidualTests:
 
 
 def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
-    """Test the residuals of a fit, window by window (no product reaches across windows).
+    """Test the residuals of a fit up to some lags [samples]; no product reaches across windows.
 
     Whether they depend on the input or on the motion is asked by sums over blocks that are longer than the residuals
-    remember: correlated noise alone does not make such a dependence.
-
-    Args:
-        fit: The fit.
-        lags: Largest lag [samples].
+    are correlated: correlated noise alone does not make such a dependence.
 
     Source:
         Ljung, System Identification, sec. 16.6; Ljung and Box, Biometrika 65, 1978; Carlstein, Annals of Statistics
@@ -142,7 +138,6 @@ Outlier: TypeAlias = tuple[str, float, float, float]
 
 
 def _stretches(outliers: Sequence[Outlier]) -> list[list[Outlier]]:
-    """Return the windows that stand out, those that follow one another together."""
     stretches: list[list[Outlier]] = []
     for one in outliers:
         last = stretches[-1][-1] if stretches else None
@@ -154,7 +149,6 @@ def _stretches(outliers: Sequence[Outlier]) -> list[list[Outlier]]:
 
 
 def _told(stretches: Sequence[Sequence[Outlier]], middle: float) -> str:
-    """Return in one sentence which stretches of which recordings stand out."""
     places: dict[str, list[str]] = {}
     for stretch in stretches:
         places.setdefault(stretch[0][0], []).append(f"{stretch[0][1]:.2f} to {stretch[-1][2]:.2f} s after its start")

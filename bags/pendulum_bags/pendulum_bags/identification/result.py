@@ -65,7 +65,7 @@ class IdentificationResult:
         held_out: Scores on recordings that took no part in the fit, by name.
         window: Length of the windows [s]; None for whole recordings.
         created: Date, ISO 8601.
-        data: What the recordings are known by, as of :func:`fingerprint`.
+        data: Fingerprints of the recordings.
         notes: What is to be known of the recordings and of how they were fitted, in sentences.
     """
 
@@ -138,11 +138,7 @@ class IdentificationResult:
         return self.fit.model.identified(self.fit.free, name)
 
     def next_step(self, plant: str) -> tuple[str, str]:
-        """Return what a plant file is to be tested by, in words and as a command: a fit does not tell what it is for.
-
-        Args:
-            plant: The file, written.
-        """
+        """Return what the plant file, written, is to be tested by, in words and as a command."""
         command = next_test_of(self._records(), plant)
         unseen = "under noise" if command else "on a recording"
         command = command or f"python -m pendulum_bags replay RECORDING --params {shlex.quote(plant)}"
@@ -156,7 +152,6 @@ class IdentificationResult:
         return f"{told.removesuffix('.')}:", command
 
     def _records(self) -> list[Mapping[str, Any]]:
-        """Return what the bags of the fit say of their runs."""
         assert isinstance(self.fit, MechanismFit)
         return [run_record(data.recording.meta) for data in self.fit.data]
 

@@ -85,12 +85,8 @@ def choose(candidates: Sequence[Candidate], *, strict: bool = False) -> Candidat
 
     Held-out windows rule out what predicts worse than the best by more than one standard error of the paired
     difference (at least 2 %, the accuracy of the fits without a fold, and at most 25 %, since few folds give no
-    honest error); among the rest the training data decide by Akaike's criterion on effective samples.
-    Static friction beyond three times the sliding one is no friction but an excuse for other faults: left out.
-
-    Args:
-        candidates: At least one.
-        strict: Schwarz's criterion in place of Akaike's.
+    honest error); among the rest the training data decide by Akaike's criterion on effective samples, or by Schwarz's
+    if ``strict``. Static friction beyond three times the sliding one is left out: it stands for other faults.
     """
     criterion = _criterion(candidates, strict=strict)
     return min(admissible(candidates), key=lambda c: criterion[id(c)])
@@ -143,7 +139,6 @@ def admissible(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _is_idle(candidate: Candidate) -> bool:
-    """Return whether a friction of the candidate beyond Coulomb's ended at 0."""
     own = set(FRICTION_MODELS[candidate.friction]) & set(candidate.free) - {"coulomb_friction"}
     return any(BOUNDS[name][0] == 0.0 and candidate.solution.model[name] <= 0.0 for name in own)
 

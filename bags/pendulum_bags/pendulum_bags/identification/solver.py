@@ -88,18 +88,10 @@ def solve(
     tolerance: float = 1e-9,
     coarse: float = 1.0,
 ) -> Solution:
-    """Minimise the robust sum of squared angle errors [rad^2]; other arguments as of :func:`arrowhead.minimise`.
+    """Minimise the robust sum of squared angle errors [rad^2], which turns from quadratic to linear at ``scale`` [rad].
 
-    Args:
-        model: Start.
-        pieces: Data.
-        free: Names of the parameters to fit.
-        own: Names of what each piece has a value of its own of.
-        states: Start of the window states; by default the pieces' first guesses.
-        scale: Where the loss turns from quadratic to linear [rad].
-        max_iterations: Most steps to try.
-        tolerance: Relative decrease of the loss below which the fit has converged.
-        coarse: Factor on the integration step; a search may take 3, a final fit 1.
+    Other arguments are those of :func:`~arrowhead.minimise`; ``coarse`` is a factor on the integration step, 1 for the
+    final fit.
     """
     begin = [piece.states for piece in pieces] if states is None else states
     motions = angle_motions(model, pieces, scale, coarse)

@@ -28,14 +28,8 @@ _CONSTANT = 0.1
 def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
     """Return least-squares (J, b, c, G, offset) of J th'' + b th' + c sgn th' + G sin th - offset = u, shape (5,).
 
-    Both sides are multiplied by a bump that vanishes with its derivatives at both ends of a sliding window and
-    integrated by parts: the derivatives fall on the bump, no signal is differentiated, and every regressor
-    passes the same filter.
-
-    Args:
-        recording: Data driven by a torque or a voltage (unit of the result: that of the input), or by nothing (per
-            unit of inertia).
-        window: Length of the bump [s].
+    Both sides are multiplied by a bump of length ``window`` [s] that vanishes with its derivatives at both ends and
+    integrated by parts: no signal is differentiated. Units are those of the input, or per unit of inertia without one.
 
     Source:
         Shinbrot, Trans. ASME 79, 1957; Preisig and Rippin, Computers chem. Engng 17, 1993 (modulating functions).
@@ -112,14 +106,7 @@ def bumps(count: int, period: float) -> tuple[Array, Array, Array]:
 
 
 def first_models(recording: Recording, fixed: FitModel, free: Sequence[str], *, spread: bool = True) -> list[FitModel]:
-    """Return start models around the equation-error estimate.
-
-    Args:
-        recording: The longest of the recordings.
-        fixed: Values of what is not free (scale, geometry) and input kind.
-        free: Parameters to be fitted.
-        spread: False gives one start only.
-    """
+    """Return start models around the equation-error estimate of the longest recording, one unless ``spread``."""
     period = recording.period
     delays = (0.0, period, 2.0 * period) if spread and "transport_delay" in free else (0.0,)
     if fixed.input_kind == "position_goal":

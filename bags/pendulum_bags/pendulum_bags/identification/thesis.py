@@ -139,16 +139,10 @@ class ThesisResult:
 
 
 def regress(trial: str, names: Sequence[str], regressors: Array, response: Array) -> Regression:
-    """Fit response = regressors @ coefficients by ordinary least squares, without intercept.
+    """Fit response (n,) = regressors (n, k) @ coefficients by ordinary least squares, without intercept.
 
-    What the two terms leave out, such as hysteresis, is as slow as the motion: thousands of its samples are a few
-    independent ones, and errors of independent residuals would be several times too small.
-
-    Args:
-        trial: For the table.
-        names: Of the regressors, length k.
-        regressors: In the order of time, shape (n, k).
-        response: shape (n,).
+    What the two terms leave out, such as hysteresis, is as slow as the motion: thousands of its samples, in the order
+    of time, are a few independent ones, and errors of independent residuals would be several times too small.
     """
     if len(response) <= len(names):
         raise DataError(f"{trial} has {len(response)} points for {len(names)} coefficients; expected more")
@@ -193,15 +187,11 @@ def _independent(regressors: Array, residual: Array, index: int) -> float:
 
 
 def fit_inertia_damping(recordings: Sequence[Recording], *, skew: float | None = None) -> ThesisResult:
-    """Regress effort on velocity and acceleration, trial by trial (experiment 1).
+    """Regress measured effort on velocity and acceleration, trial by trial (experiment 1).
 
     The interval of the inertia combines the scatter of the trials with the unknown time between the samples of
-    velocity and effort, taken as uniformly distributed (ISO/IEC Guide 98-3, type B).
-
-    Args:
-        recordings: Flat pendulum moved by hand; the effort is the measured one, at the stamps of the velocity.
-        skew: Longest time between velocity and effort of one sample [s]; by default that of one actuator record
-            (``RECORD_SKEW``) for a bag, and half a sampling period for other files.
+    velocity and effort, taken as uniformly distributed (ISO/IEC Guide 98-3, type B): up to ``skew`` [s], by default
+    that of one actuator record (``RECORD_SKEW``) for a bag, and half a sampling period for other files.
 
     Raises:
         DataError: where velocity or effort is missing.
@@ -261,7 +251,6 @@ def _skew(recording: Recording) -> float:
 
 
 def _noise_share(velocity: Array, acceleration: Array, period: float) -> float:
-    """Return the share of white noise of the velocity in the power of its central differences."""
     # Second differences of a motion that is smooth at the sampling rate are noise: six times its variance.
     noise = np.mean(np.diff(velocity, 2) ** 2) / 6.0
     return float(min(1.0, noise / (2.0 * period**2) / max(float(np.mean(acceleration**2)), 1e-300)))
@@ -286,9 +275,6 @@ def static_holds(recording: Recording) -> list[StaticHold]:
 
 def fit_gravity(recordings: Sequence[Recording]) -> ThesisResult:
     """Regress the mean effort of static holds on sin(theta), trial by trial (experiment 2).
-
-    Args:
-        recordings: Staircases up and down, measured effort.
 
     Raises:
         DataError: where a recording has fewer than four holds.

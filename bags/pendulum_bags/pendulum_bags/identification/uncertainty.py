@@ -65,21 +65,15 @@ def assess(
     With white residuals the intervals are those of least squares (the window states profiled out), corrected for
     the robust loss. With correlated residuals the largest of three errors counts: consistent under serial
     correlation, clustered by window, and the jackknife over the folds, which also sees how the parameters move from
-    one part of the data to another. The choice among friction models and offsets is part of the error: what the
-    models that the data speak for nearly as well say is counted by their Akaike weights. An error of the model
-    itself (something that no candidate has) is in no interval; the residual tests say where there is one.
+    one part of the data to another. Friction models and offsets that the data speak for nearly as well count by their
+    Akaike weights. An error of the model itself (something that no candidate has) is in no interval.
 
-    Args:
-        fit: The fit.
-        tests: Its residual tests.
-        profiles: For how many of the weakest parameters to compute profile intervals.
-        explains: Whether the fit explains the motion; else its cost excludes nothing that the folds leave open.
-        alone: What each of several recordings says alone.
+    ``profiles`` of the weakest parameters get profile intervals. Of a fit that does not explain the motion the cost
+    excludes nothing that the folds leave open.
 
     Source:
-        Ljung, System Identification, ch. 9; Newey and West, Econometrica 55, 1987; Liang and Zeger, Biometrika
-        73, 1986 (clusters); Efron and Tibshirani, An Introduction to the Bootstrap, ch. 11 (grouped jackknife);
-        Huber, Robust Statistics, sec. 7.6; Buckland, Burnham and Augustin, Biometrics 53, 1997 (model choice).
+        Ljung, System Identification, ch. 9; Efron and Tibshirani, An Introduction to the Bootstrap, ch. 11 (grouped
+        jackknife); Buckland, Burnham and Augustin, Biometrics 53, 1997 (model choice).
     """
     chosen = fit.chosen
     model = chosen.solution.model
@@ -147,10 +141,7 @@ def _interval(name: str, model: FitModel, deviation: float, white: float, quanti
 def _widen_by_joint_offsets(
     intervals: dict[str, Interval], fit: OutputErrorFit, quantile: float, *, white: bool
 ) -> None:
-    """Widen the interval of an offset that was kept alone to what a fit of both offsets leaves open.
-
-    Left out is not known to be 0: near one angle either offset does the work of the other.
-    """
+    """Widen the interval of a single offset to what a fit of both leaves open: near one angle they act alike."""
     joint = next((c for c in fit.offset_candidates if set(OFFSETS) <= set(c.free)), None)
     kept = [name for name in OFFSETS if name in fit.chosen.free]
     if joint is None or len(kept) != 1 or kept[0] not in intervals:
@@ -194,8 +185,7 @@ def _with_model_choice(fit: OutputErrorFit, own: Errors, *, white: bool) -> dict
 def _with_dry_friction(fit: OutputErrorFit, own: Errors, *, white: bool) -> dict[str, float]:
     """Return the errors that a fit with Coulomb friction has, where one without was chosen.
 
-    Held-out windows prefer fewer parameters where noise is large. That is no proof that there is no dry friction: left
-    out is not known to be 0, and the damping has done its work too.
+    Left out is not known to be 0: held-out windows prefer fewer parameters where noise is large.
     """
     rival = next((c for c in fit.candidates if c.friction == "coulomb"), None)
     if fit.chosen.friction != "viscous" or rival is None:
