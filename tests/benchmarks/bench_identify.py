@@ -249,10 +249,10 @@ def _double_pendulum_of_two_joints() -> Iterator[Row]:
     """Each record predicted by parameters from the other three: 0.5 s windows, the start of each fitted."""
     import numpy as np
 
-    from pendulum_bags.identification.identify_mechanism import identify_mechanism
+    from pendulum_bags.identification.identify import identify_joints
+    from pendulum_bags.identification.joint_fit import prepare_windows, scores
+    from pendulum_bags.identification.joint_model import JointModel
     from pendulum_bags.identification.joint_recordings import JointRecording
-    from pendulum_bags.identification.mechanism_fit import prepare_windows, scores
-    from pendulum_bags.identification.mechanism_model import MechanismModel
     from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 
     start = load_mechanism("double_pendulum")
@@ -262,18 +262,18 @@ def _double_pendulum_of_two_joints() -> Iterator[Row]:
         position, effort = (np.stack([table[f"{n}{i}"] for i in (1, 2)], axis=1) for n in ("pos_meas", "tau_meas"))
         logs.append(JointRecording(path.name, table["time"], position, effort, ("linear", "linear"), str(path)))
 
-    def error(model: MechanismModel, log: JointRecording, own: tuple[str, ...] = ()) -> float:
+    def error(model: JointModel, log: JointRecording, own: tuple[str, ...] = ()) -> float:
         return float(np.sqrt(np.mean(scores(model, [prepare_windows(log, 0.5)], own=own)[0].rms ** 2)))
 
     targets = (0.0065, 0.0085, 0.012, 0.015)
     plain = (0.0075, 0.0118, 0.0222, 0.0288)
     for i, (log, target, least) in enumerate(zip(logs, targets, plain, strict=True)):
-        result = identify_mechanism(start, [*logs[:i], *logs[i + 1 :]], stride=4)
+        result = identify_joints(start, [*logs[:i], *logs[i + 1 :]], stride=4)
         yield measured(
             f"double pendulum, {log.name} by the other three records",
             error(result.model, log, result.fit.own),
             "rad",
-            peer=Peer("published parameters", error(MechanismModel.of(start), log)),
+            peer=Peer("published parameters", error(JointModel.of(start), log)),
             at_most=target,
             note=f"plain least squares {least} rad; {result.choice}",
         )

@@ -16,7 +16,7 @@ from pendulum_bags.comparison import Looks, Margins, Outcome
 from pendulum_bags.comparison.equivalence import EquivalenceTest, conclude
 from pendulum_bags.comparison.long_run import Disturbance
 from pendulum_bags.comparison.same_run import paired_tests, unpaired_tests
-from pendulum_bags.identification.identify_mechanism import identify_mechanism
+from pendulum_bags.identification.identify import identify_joints
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.ranking.present import REGRET_MARGIN
 from pendulum_bags.runs.series import Series, Signal
@@ -209,7 +209,7 @@ def identified(seed: int, preset: str) -> tuple[int, int]:
     run = run_balanced(preset, seed)
     time = 0.002 * np.arange(len(run.position), dtype=np.float64)
     recording = JointRecording("run", time, run.position, run.effort, ("zero", "zero"), velocity=run.velocity)
-    result = identify_mechanism(load_mechanism(preset), [recording])
+    result = identify_joints(load_mechanism(preset), [recording])
     held = [] if result.refused else [i.low <= run.truth.get(n, 0.0) <= i.high for n, i in result.intervals.items()]
     return len(held) - sum(held), len(held)
 

@@ -10,12 +10,12 @@ from scipy.integrate import solve_ivp
 
 from pendulum_bags.commands import identify_cli, replay_cli
 from pendulum_bags.identification.between_recordings import Alone, half_width
-from pendulum_bags.identification.identify_mechanism import identify_mechanism
+from pendulum_bags.identification.identify import identify_joints
+from pendulum_bags.identification.joint_fit import fit, prepare_windows, scores, window_length
+from pendulum_bags.identification.joint_kernel import motion_kernel
+from pendulum_bags.identification.joint_model import DELAY, LAG, JointModel, tellable
+from pendulum_bags.identification.joint_readings import better_reading
 from pendulum_bags.identification.joint_recordings import JointRecording, read_joints
-from pendulum_bags.identification.mechanism_doubt import better_reading
-from pendulum_bags.identification.mechanism_fit import fit, prepare_windows, scores, window_length
-from pendulum_bags.identification.mechanism_kernel import motion_kernel
-from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel, tellable
 from pendulum_bags.recordings.mapping import FORMAT
 from pendulum_msgs_py.contract.cdr import encode_joints
 from pendulum_msgs_py.errors import DataError
@@ -64,7 +64,7 @@ def both_driven():
 @pytest.mark.parametrize("name", ["acrobot", "cart_pole", "furuta"])
 def test_a_mechanism_is_found_again_within_one_and_a_half_times_its_intervals(name):
     plant = truth(name)
-    result = identify_mechanism(plant.with_values(OFF[name]), [motion(plant, 3)], extras="friction")
+    result = identify_joints(plant.with_values(OFF[name]), [motion(plant, 3)], extras="friction")
     assert not result.refused, result.refusal
     for key in tellable(plant):
         interval = result.intervals[key]
@@ -76,7 +76,7 @@ def test_a_mechanism_is_found_again_within_one_and_a_half_times_its_intervals(na
 def test_two_driven_joints_are_found_from_a_start_that_is_off_and_a_held_out_run_is_predicted_to_the_noise(both_driven):
     plant = truth("double_pendulum")
     start = plant.with_values(OFF["double_pendulum"])
-    result = identify_mechanism(start, both_driven[:1], held_out=both_driven[1:], extras="friction")
+    result = identify_joints(start, both_driven[:1], held_out=both_driven[1:], extras="friction")
     (score,) = result.held_out.values()
     assert score.rms.max() < 10.0 * NOISE
     assert result.plant().value("inertia_2") == pytest.approx(plant.value("inertia_2"), rel=0.03)
@@ -86,7 +86,7 @@ def test_two_driven_joints_are_found_from_a_start_that_is_off_and_a_held_out_run
 def test_the_simulated_motion_is_that_of_scipy_under_an_input_that_comes_late_and_lags(both_driven):
     plant = truth("double_pendulum").with_values({f"{j}.coulomb_friction": 0.0 for j in ("shoulder", "elbow")})
     names, delay, lag = ("shoulder.effort_offset", "elbow.angle_offset", DELAY, LAG), 0.0123, 0.03
-    start = MechanismModel.of(plant)
+    start = JointModel.of(plant)
     changed = start.with_changes(dict(zip(names, (0.05, 0.1, delay, lag), strict=True)))
     period, held = 0.01, np.random.default_rng(4).uniform(-1.0, 1.0, (60, 2))
     one = both_driven[0]
@@ -121,7 +121,7 @@ def test_the_simulated_motion_is_that_of_scipy_under_an_input_that_comes_late_an
 
 
 def test_a_step_in_which_joints_rest_and_break_away_ends_where_fifty_short_ones_do():
-    model, count, step = MechanismModel.of(load_mechanism("acrobot")), 20000, 5e-4
+    model, count, step = JointModel.of(load_mechanism("acrobot")), 20000, 5e-4
     rng = np.random.default_rng(0)
     bounds = np.array((0.03, 0.05, 0.0, 0.003))
     states = (np.pi, 0.0, 0.0, 0.0) + bounds * rng.uniform(-1.0, 1.0, (count, 4))
@@ -153,7 +153,7 @@ def test_intervals_from_a_run_held_upright_hold_the_values_of_a_machine_that_is_
     recording = JointRecording(
         "hw", time, run.position[:stop], run.effort[late:], ("zero", "zero"), velocity=run.velocity[:stop]
     )
-    result = identify_mechanism(plant, [recording])
+    result = identify_joints(plant, [recording])
     assert not result.refused, result.refusal
     assert window[0] <= result.window <= window[1]
     truth = {**run.truth, "delay": run.truth["delay"] + 0.002 * late}
@@ -177,7 +177,7 @@ def test_a_tare_that_no_common_offset_explains_is_found_as_one_of_a_recording():
         JointRecording(name, time, run.position[at], run.effort[at] + tare, ("zero", "zero"), velocity=run.velocity[at])
         for name, at, tare in (("a", slice(0, half), 0.0), ("b", slice(half, 2 * half), np.array([0.5, 0.0])))
     ]
-    result = identify_mechanism(plant, halves)
+    result = identify_joints(plant, halves)
     assert not result.refused, result.refusal
     assert result.fit.own == ("cart.effort_offset",)
     np.testing.assert_allclose(np.diff(result.fit.offsets, axis=0), [[-0.5]], atol=1e-4)
@@ -207,20 +207,20 @@ def test_what_a_recording_cannot_be_is_refused_in_a_sentence(both_driven, tmp_pa
     one = both_driven[0]
     still = replace(one, position=one.position * [1.0, 0.0])
     with pytest.raises(DataError, match="joint elbow moves by 0 rad"):
-        identify_mechanism(plant, [still])
+        identify_joints(plant, [still])
     with pytest.raises(DataError, match="1 joints; expected 2: shoulder, elbow"):
-        identify_mechanism(plant, [replace(one, position=one.position[:, :1], effort=one.effort[:, :1])])
+        identify_joints(plant, [replace(one, position=one.position[:, :1], effort=one.effort[:, :1])])
     short = replace(one, time=one.time[:200], position=one.position[:200], effort=one.effort[:200])
     with pytest.raises(DataError, match="expected at least 5"):
-        identify_mechanism(plant, [short])
+        identify_joints(plant, [short])
     with pytest.raises(DataError, match="the same samples"):
-        identify_mechanism(plant, [one, one])
+        identify_joints(plant, [one, one])
 
 
 def test_swapped_columns_are_refused_by_name(both_driven):
     one = both_driven[0]
     swapped = replace(one, position=one.position[:, ::-1], effort=one.effort[:, ::-1])
-    result = identify_mechanism(truth("double_pendulum"), [swapped], extras="friction")
+    result = identify_joints(truth("double_pendulum"), [swapped], extras="friction")
     assert result.refused
     assert "columns of shoulder and elbow exchanged" in result.sentences()[0]
 
@@ -238,7 +238,7 @@ def test_a_wrong_sign_and_an_angle_against_the_world_are_refused_by_name(name, s
     plant = truth(name)
     one = motion(plant, 3, seconds)
     wrong = replace(one, position=one.position @ np.array(position, dtype=float).T, effort=one.effort * effort)
-    result = identify_mechanism(plant, [wrong], extras="friction")
+    result = identify_joints(plant, [wrong], extras="friction")
     assert result.refused
     assert words in result.sentences()[0]
 
@@ -247,7 +247,7 @@ def test_a_wrong_sign_and_an_angle_against_the_world_are_refused_by_name(name, s
 def test_a_value_ten_times_off_the_start_is_refused_whichever_is_larger(factor):
     plant = truth("furuta")
     far = plant.with_values({"arm_inertia": plant.value("arm_inertia") * factor})
-    result = identify_mechanism(far, [motion(plant, 3)], extras="friction")
+    result = identify_joints(far, [motion(plant, 3)], extras="friction")
     assert "arm_inertia is" in result.sentences()[0]
     assert "expected a plant that is near, or a start that is" in result.sentences()[0]
 
@@ -259,7 +259,7 @@ def test_degrees_and_milli_newton_metres_are_refused_by_their_unit(both_driven, 
     one = both_driven[0]
     wrong = replace(one, position=turn * one.position, effort=scale * one.effort)
     try:
-        said = identify_mechanism(truth("double_pendulum"), [wrong], extras="friction").refusal or "accepted"
+        said = identify_joints(truth("double_pendulum"), [wrong], extras="friction").refusal or "accepted"
     except DataError as error:
         said = str(error)
     assert words in said
@@ -323,7 +323,7 @@ def test_rows_with_nan_are_left_out_and_counted(both_driven, tmp_path):
     read = read_joints(path, truth("double_pendulum").coordinates)
     assert (read.left_out, read.time.size) == (3, one.time.size - 3)
     assert np.isfinite(read.position).all()
-    assert scores(MechanismModel.of(truth("double_pendulum")), [prepare_windows(read, 1.0)])[0].rms.max() < 20.0 * NOISE
+    assert scores(JointModel.of(truth("double_pendulum")), [prepare_windows(read, 1.0)])[0].rms.max() < 20.0 * NOISE
 
 
 def test_a_real_double_pendulum_is_predicted_far_better_than_by_its_published_parameters(shared_data, tmp_path):
@@ -341,7 +341,7 @@ def test_a_real_double_pendulum_is_predicted_far_better_than_by_its_published_pa
     one, other = (read_joints(folder / f"c1_{key}.csv", start.coordinates, mapping) for key in ("143339", "143524"))
     third = read_joints(folder / "c1_143704.csv", start.coordinates, mapping)
     data = [prepare_windows(recording, 2.0, stride=5) for recording in (one, third)]
-    model = MechanismModel.of(start)
+    model = JointModel.of(start)
     found = fit(model, data, model.fitted(), np.ones(2), most=10, tolerance=1e-3)
     held_out = [prepare_windows(other, 0.5, stride=5)]
     ours, published = (float(np.sqrt(np.mean(scores(m, held_out)[0].rms ** 2))) for m in (found.model, model))
@@ -455,7 +455,7 @@ def test_the_next_step_of_several_joints_is_the_experiment_that_recorded_them(bo
     command = "python -m pendulum_bags experiment joints --plant acrobot --seed 3"
     told = {"pendulum.run": {"command": command, "seed": 3}}
     start = truth("double_pendulum")
-    result = identify_mechanism(start, [replace(both_driven[0], meta=told)], extras="friction")
+    result = identify_joints(start, [replace(both_driven[0], meta=told)], extras="friction")
     assert result.next_step("my.yaml")[1] == ("python -m pendulum_bags experiment joints --plant my.yaml --seed 4")
 
 
@@ -464,7 +464,7 @@ def test_the_starts_of_windows_are_fitted_in_metres_and_radians_by_what_each_joi
     noise = np.random.default_rng(0).normal(0.0, 1.0, one.position.shape) * [NOISE, 0.05]
     data = [prepare_windows(replace(one, position=one.position + noise), 0.3)]
     # Weighed alike, the noise of the pole in radians bends the cart by half a millimetre.
-    assert scores(MechanismModel.of(plant), data)[0].rms[0] < 1.6 * NOISE
+    assert scores(JointModel.of(plant), data)[0].rms[0] < 1.6 * NOISE
 
 
 def test_a_held_out_run_in_which_a_joint_hardly_moves_refuses_no_good_fit(both_driven):
@@ -476,7 +476,7 @@ def test_a_held_out_run_in_which_a_joint_hardly_moves_refuses_no_good_fit(both_d
         position=rng.normal(0.0, NOISE, one.position.shape) + np.linspace(0.0, 2e-3, one.time.size)[:, None],
         effort=np.zeros_like(one.effort),
     )
-    result = identify_mechanism(plant, [one], held_out=[still], extras="friction")
+    result = identify_joints(plant, [one], held_out=[still], extras="friction")
     assert not result.refused, result.refusal
 
 
@@ -485,7 +485,7 @@ def test_windows_in_which_something_else_pushes_are_left_out_and_named(both_driv
     position = one.position.copy()
     pushed = (one.time > 2.5) & (one.time < 3.5)
     position[pushed] += (0.8 * np.sin(np.pi * (one.time[pushed] - 2.5)) ** 2)[:, None]
-    result = identify_mechanism(plant, [replace(one, position=position)], extras="friction", window=0.5)
+    result = identify_joints(plant, [replace(one, position=position)], extras="friction", window=0.5)
     assert not result.refused, result.refusal
     assert any(note.startswith("Left out, since something that was not recorded") for note in result.notes)
     assert result.model["inertia_2"] == pytest.approx(plant.value("inertia_2"), rel=0.05)
@@ -497,7 +497,7 @@ def test_the_windows_of_motion_about_an_unstable_equilibrium_are_short():
     rng = np.random.default_rng(2)
     near = np.column_stack((0.05 * np.sin(one.time), np.pi + 0.02 * np.sin(3.0 * one.time)))
     balanced = replace(one, position=near + rng.normal(0.0, NOISE, near.shape))
-    model = MechanismModel.of(plant)
+    model = JointModel.of(plant)
     length = window_length(model, [balanced], 5.0)
     # The pole falls at sqrt(m g c / J) = 3.8 1/s and the cart makes it faster: a factor of 30 within a second or so.
     assert 0.4 < length < 1.5
@@ -510,7 +510,7 @@ def test_sizes_that_the_motion_does_not_determine_are_held_and_said_so():
     rng = np.random.default_rng(1)
     # The pole hardly swings: its inertia and centre are anything.
     quiet = replace(one, position=np.column_stack((one.position[:, 0], 2e-3 * rng.standard_normal(one.time.size))))
-    result = identify_mechanism(plant, [quiet], extras="friction", window=0.5)
+    result = identify_joints(plant, [quiet], extras="friction", window=0.5)
     written = not result.refused and result.plant()
     if written:
         assert "do not determine" in " ".join(result.sentences())
@@ -524,7 +524,7 @@ def test_recordings_of_a_mechanism_have_offsets_of_their_own_and_those_of_two_ma
     one, other = motion(plant, 1), motion(plant, 2)
     tared = replace(other, effort=other.effort + tare)
     third = replace(motion(plant, 3), effort=motion(plant, 3).effort - tare)
-    result = identify_mechanism(plant, [one, tared], held_out=[third], extras="friction")
+    result = identify_joints(plant, [one, tared], held_out=[third], extras="friction")
     assert result.fit.own == ("shoulder.effort_offset", "elbow.effort_offset")
     assert result.fit.offsets[1] - result.fit.offsets[0] == pytest.approx(-tare, abs=0.01)
     assert any("a zero of its own" in note for note in result.notes)
@@ -533,9 +533,9 @@ def test_recordings_of_a_mechanism_have_offsets_of_their_own_and_those_of_two_ma
     )
     (score,) = result.held_out.values()
     assert score.rms.max() < 10.0 * NOISE
-    assert not identify_mechanism(plant, [one, other], extras="friction").fit.own
+    assert not identify_joints(plant, [one, other], extras="friction").fit.own
     heavier = motion(plant.with_values({"inertia_2": 1.4 * plant.value("inertia_2")}), 2)
-    two = identify_mechanism(plant, [one, heavier], extras="friction")
+    two = identify_joints(plant, [one, heavier], extras="friction")
     assert any("exclude each other: fitted alone, inertia_2 is" in said for said in two.sentences())
 
 
@@ -560,7 +560,7 @@ def test_a_torque_recorded_at_a_passive_joint_acts_and_is_said_so(tmp_path):
     path = save(tmp_path / "run.csv", motion(both, 1), ("shoulder", "elbow"), (0, 1))
     read = read_joints(path, plant.coordinates)
     assert read.passive_effort == ("shoulder",)
-    result = identify_mechanism(plant, [read], extras="friction")
+    result = identify_joints(plant, [read], extras="friction")
     assert not result.refused, result.refusal
     assert any("no actuator at shoulder" in note for note in result.notes)
 
@@ -595,9 +595,9 @@ def test_chaotic_motion_is_fitted_in_windows_over_which_neighbours_stay_together
     free = {f"{joint}.{key}": 0.0 for joint in ("shoulder", "elbow") for key in ("coulomb_friction", "damping")}
     plant = truth("double_pendulum").with_values(free)
     chaotic = motion(plant, 5, seconds=30.0, swing=2.5)
-    length = window_length(MechanismModel.of(plant), [chaotic], 5.0)
+    length = window_length(JointModel.of(plant), [chaotic], 5.0)
     assert length < 3.0
-    result = identify_mechanism(plant.with_values(OFF["double_pendulum"]), [chaotic], extras="friction")
+    result = identify_joints(plant.with_values(OFF["double_pendulum"]), [chaotic], extras="friction")
     assert not result.refused, result.refusal
     assert result.window < 3.0
     assert result.model["inertia_2"] == pytest.approx(plant.value("inertia_2"), rel=0.03)

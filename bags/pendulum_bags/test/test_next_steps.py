@@ -278,7 +278,7 @@ def test_identify_tells_the_experiment_that_recorded_its_data() -> None:
 def test_the_next_step_says_what_is_missing_and_how_much() -> None:
     recording = swing()
     result = identify([recording], QUICK, profiles=0)
-    explained = replace(result.explained, share=0.0432, doubt=None)
+    explained = replace(result.explained, share=0.0432, incomplete=None)
     whole = replace(result, explained=explained, tests=replace(result.tests, incomplete=False, outliers=()))
     assert whole.next_step("my.yaml")[0].startswith("It misses 4.3 % of what straight lines through the windows miss; ")
     assert not whole.incomplete
@@ -287,7 +287,7 @@ def test_the_next_step_says_what_is_missing_and_how_much() -> None:
     assert lacking.next_step("my.yaml")[0].startswith(
         "The model is incomplete. Apart from the windows named above, it misses 4.3 % of what"
     )
-    assert replace(whole, explained=replace(explained, doubt="A part is not explained.")).incomplete
+    assert replace(whole, explained=replace(explained, incomplete="A part is not explained.")).incomplete
 
 
 def test_windows_that_stand_out_one_after_the_other_are_one_stretch_and_all_stretches_one_sentence() -> None:

@@ -8,7 +8,7 @@ from functools import cache
 
 import numpy as np
 
-from pendulum_bags.identification.identify_mechanism import identify_mechanism
+from pendulum_bags.identification.identify import identify_joints
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_msgs_py.errors import PendulumError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
@@ -113,7 +113,7 @@ def joint_verdict(name: str, seed: int) -> tuple[str, str]:
     mechanism, words, spoiled = MECHANISMS[name]
     plant = truth(mechanism)
     try:
-        result = identify_mechanism(plant, [spoiled(motion(plant, seed))], extras="friction")
+        result = identify_joints(plant, [spoiled(motion(plant, seed))], extras="friction")
     except PendulumError as error:
         said, refused = str(error), True
     else:

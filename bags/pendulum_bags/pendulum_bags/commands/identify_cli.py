@@ -111,7 +111,7 @@ def identify(
     context.call_on_close(partial(show_guesses, make_console(stderr=True), readings, write_mapping))
     if plant is not None:
         _refuse_unheeded(context, "--plant", _FOR_SEVERAL_JOINTS)
-        from pendulum_bags.identification.identify_mechanism import identify_mechanism
+        from pendulum_bags.identification.identify import identify_joints
         from pendulum_bags.identification.joint_recordings import read_joints
         from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 
@@ -119,7 +119,7 @@ def identify(
         if len(start.joints) == 1:
             raise DataError(f"plant {start.name!r} has one joint; expected a mechanism, or no --plant for one joint")
         logs = [read_joints(reading, start.coordinates) for reading in readings]
-        joints = identify_mechanism(start, logs[: len(data)], held_out=logs[len(data) :], window=window)
+        joints = identify_joints(start, logs[: len(data)], held_out=logs[len(data) :], window=window)
         _finish(joints, joints.write(out, name=name) if out and not joints.refused else None, page, as_json)
         return
     if method not in {"output_error", "thesis"}:

@@ -41,7 +41,7 @@ class Explained:
         lines: Error of the best straight line through each of those windows.
         share: Their ratio, of the joint where it is worst: 0 explains everything, 1 as much as no model at all.
         refusal: Sentence that the fit is no model of this motion; None where it is one.
-        doubt: Sentence that a part of the motion is not explained; None where it is, or where noise hides it.
+        incomplete: Sentence that a part of the motion is not explained; None where it is, or where noise hides it.
         joints: Of the plant.
     """
 
@@ -49,7 +49,7 @@ class Explained:
     lines: tuple[float, ...]
     share: float
     refusal: str | None
-    doubt: str | None = None
+    incomplete: str | None = None
     joints: tuple[Joint, ...] = ONE_JOINT.joints
 
     @property
@@ -97,14 +97,14 @@ def explained(fit: OutputErrorFit, outliers: Sequence[tuple[str, float, float, f
             "moves this pendulum, or the columns are of something else."
         )
     excess = math.sqrt(max(rms**2 - noise**2, 0.0))
-    doubt = None
+    incomplete = None
     if refusal is None and straight > 3.0 * noise and excess > DOUBTFUL_SHARE * straight:
-        doubt = (
+        incomplete = (
             f"{INCOMPLETE}: the fit misses {100.0 * share:.0f} % of the motion ({rms:.3g} rad rms; "
             f"straight lines miss {straight:.3g} rad, and the sensor's noise is {noise:.2g} rad). Something moves the "
             "pendulum that is not in the model or not in the recording; no interval covers it."
         )
-    return Explained((rms,), (straight,), share, refusal, doubt)
+    return Explained((rms,), (straight,), share, refusal, incomplete)
 
 
 def undetermined_fit(fit: OutputErrorFit, uncertainty: Uncertainty) -> str | None:

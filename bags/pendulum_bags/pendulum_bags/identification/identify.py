@@ -1,4 +1,4 @@
-"""Identification from recordings to the judged result: fit, residuals, intervals, geometry, held-out scores."""
+"""Identification from recordings to the judged result, of one joint or several."""
 
 from __future__ import annotations
 
@@ -11,24 +11,43 @@ from threadpoolctl import threadpool_limits
 
 from pendulum_bags.identification.between_recordings import Alone, excluding
 from pendulum_bags.identification.covariance import FREQUENCY, candidate_errors
-from pendulum_bags.identification.explained import REFUSED, explained, undetermined_fit
+from pendulum_bags.identification.explained import REFUSED, Explained, explained, undetermined_fit
 from pendulum_bags.identification.geometry import check_geometry
+from pendulum_bags.identification.joint_fit import prepare_windows
+from pendulum_bags.identification.joint_fit import scores as joint_scores
+from pendulum_bags.identification.joint_model import tellable
+from pendulum_bags.identification.joint_readings import explained_joints, refusal, undetermined_joints
+from pendulum_bags.identification.joint_recordings import JointRecording
+from pendulum_bags.identification.joint_search import search
+from pendulum_bags.identification.joint_uncertainty import assess_joints, each_alone, hold_undetermined
 from pendulum_bags.identification.options import DEFAULTS, Options
 from pendulum_bags.identification.output_error import OutputErrorFit, fit_output_error
+from pendulum_bags.identification.own_offsets import OwnOffsets
 from pendulum_bags.identification.problem import prepare
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_bags.identification.residual_tests import residual_tests
-from pendulum_bags.identification.result import PendulumResult, check_distinct, data_sentences, fingerprint
+from pendulum_bags.identification.result import (
+    IdentificationResult,
+    PendulumResult,
+    check_distinct,
+    data_sentences,
+    fingerprint,
+)
 from pendulum_bags.identification.solver import solve
 from pendulum_bags.identification.uncertainty import assess
 from pendulum_bags.identification.window_score import free_run, window_score
 from pendulum_bags.runs.datasets import Recording, distinct_names
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["identify"]
+__all__ = ["identify", "identify_joints"]
 
 _ONE_MACHINE = {FREQUENCY: 1.1, "inertia": 1.35, "gravity": 1.35}
 """Ratios up to which what differs from recording to recording may be one machine's: what the model lacks moves them."""
+
+
+_ONE_SIZE = 1.1
+"""The same for a size of several joints, which share no scale."""
 
 
 # BLAS splits long sums by the cores that it finds, and a fit magnifies the last digits: on one core, a recording has
@@ -66,10 +85,7 @@ def identify(
     uncertainty = assess(fit, tests, profiles=profiles, explains=explains, alone=alone)
     if account.refusal is None and (lost := undetermined_fit(fit, uncertainty)) is not None:
         account = replace(account, refusal=lost)
-    two = excluding(alone, _ONE_MACHINE, fit.model.unit)
-    if account.refusal is not None and two is not None:
-        # What one fit to two machines lacks is no fault of either recording.
-        account = replace(account, refusal=f"{REFUSED}: {two[0].lower()}{two[1:]}")
+    account, two = _one_machine(account, excluding(alone, _ONE_MACHINE, fit.model.unit))
     geometry = check_geometry(fit.model, uncertainty, options.geometry)
     scores = {}
     for name, recording in zip(distinct_names(held_out), held_out, strict=True):
@@ -77,7 +93,6 @@ def identify(
             scores[name] = free_run(fit.model, recording, fitted=False)
         else:
             scores[name] = window_score(fit.model, recording, fit.window)
-    created = datetime.now(timezone.utc).isoformat(timespec="seconds")
     moved = {
         name: found
         for name, recording in zip(scores, held_out, strict=True)
@@ -93,14 +108,25 @@ def identify(
         {},
         scores,
         fit.window,
-        created,
+        _now(),
         tuple(map(fingerprint, fit.recordings)),
         tuple(data_sentences(fit, delay, refused=account.refusal is not None)),
+        two,
         tests,
         geometry,
         moved,
-        two,
     )
+
+
+def _one_machine(account: Explained, two: str | None) -> tuple[Explained, str | None]:
+    """Return how much is explained: what one fit to two machines lacks is no fault of either recording."""
+    if account.refusal is not None and two is not None:
+        account = replace(account, refusal=f"{REFUSED}: {two[0].lower()}{two[1:]}")
+    return account, two
+
+
+def _now() -> str:
+    return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
 def _alone(fit: OutputErrorFit) -> list[Alone]:
@@ -124,3 +150,84 @@ def _moved_zero(fit: OutputErrorFit, recording: Recording, rms: float) -> tuple[
     found = solve(fit.model, [piece], ("angle_offset",), scale=fit.scale, tolerance=1e-5, max_iterations=20)
     own = window_score(found.model, recording, fit.window).rms
     return (found.model["angle_offset"] - fit.model["angle_offset"], own) if own < 0.8 * rms else None
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def identify_joints(
+    plant: PlantParameters,
+    recordings: Sequence[JointRecording],
+    *,
+    held_out: Sequence[JointRecording] = (),
+    window: float | None = None,
+    extras: str | None = None,
+    stride: int = 1,
+) -> IdentificationResult:
+    """Identify a mechanism by output error and judge the result.
+
+    Args:
+        plant: Start, and what is held: lengths, gears, gravity, masses that the motion does not determine.
+        recordings: Data to fit, all of one machine.
+        held_out: Recordings to score only.
+        window: Length of the windows [s]; by default a sixth of the data, between 0.5 and 5 s, or what
+            neighbouring motions stay together for.
+        extras: One of ``EXTRAS``; None lets held-out windows choose.
+        stride: Take every n-th position.
+
+    Raises:
+        DataError: A recording is too short, of other joints, or one joint of it does not move.
+    """
+    for recording in (*recordings, *held_out):
+        recording.check(plant.coordinates)
+    check_distinct(recordings, held_out)
+    best = search(plant, recordings, window, extras, stride)
+    found, held = hold_undetermined(best.fit)
+    names = distinct_names([*recordings, *held_out])
+    training = dict(zip(names, found.scores, strict=False))
+    others = [prepare_windows(recording, best.length, stride=stride) for recording in held_out]
+    outside = dict(
+        zip(names[len(recordings) :], joint_scores(found.model, others, found.weights, own=found.own), strict=True)
+    )
+    alone = each_alone(found)
+    uncertainty = assess_joints(found, held, alone)
+    account = explained_joints(found, refusal(found, training, outside) or undetermined_joints(found, uncertainty))
+    sizes = dict.fromkeys((name for name in tellable(plant) if name in found.free), _ONE_SIZE)
+    account, two = _one_machine(account, excluding(alone, sizes, found.model.unit))
+    notes = _notes(recordings, best.pushed)
+    if found.own:
+        zeros = OwnOffsets(found.own, found.offsets - found.offsets.mean(axis=0))
+        notes.append(zeros.sentence(names[: len(recordings)], found.model.unit))
+    if best.parted:
+        notes.append(
+            f"Windows of {best.length:.2g} s: over longer ones neighbouring motions part (chaos, or no balance)."
+        )
+    return IdentificationResult(
+        found,
+        best.extras,
+        {name: (error, None) for name, error in best.candidates.items()},
+        uncertainty,
+        account,
+        training,
+        outside,
+        best.length,
+        _now(),
+        tuple(map(fingerprint, recordings)),
+        tuple(notes),
+        two,
+    )
+
+
+def _notes(recordings: Sequence[JointRecording], pushed: Sequence[tuple[str, float, float]]) -> list[str]:
+    notes = [
+        f"{r.name}: {r.left_out} rows with a NaN or a repeated stamp are left out." for r in recordings if r.left_out
+    ]
+    notes += [f"{r.name}: {r.renamed}." for r in recordings if r.renamed]
+    passive = {joint for r in recordings for joint in r.passive_effort}
+    if passive:
+        notes.append(
+            f"The plant has no actuator at {', '.join(sorted(passive))}, yet an effort was recorded there: the fit "
+            "counts it as acting."
+        )
+    if pushed:
+        listing = ", ".join(f"{name} from {first:.2f} to {last:.2f} s" for name, first, last in pushed)
+        notes.append(f"Left out, since something that was not recorded moves the machine there: {listing}.")
+    return notes

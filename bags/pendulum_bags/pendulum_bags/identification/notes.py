@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.identification.mechanism_fit import MechanismFit
+from pendulum_bags.identification.joint_fit import JointFit
 from pendulum_bags.identification.model import BOUNDS
 from pendulum_bags.identification.output_error import OutputErrorFit
 from pendulum_bags.identification.selection import at_bounds
@@ -135,7 +135,7 @@ def edge_sentences(intervals: Mapping[str, Interval], fit: OutputErrorFit, unres
     return said
 
 
-def held_sentences(found: MechanismFit, undetermined: Sequence[str]) -> list[str]:
+def held_sentences(found: JointFit, undetermined: Sequence[str]) -> list[str]:
     """Return what was held in the fit of a mechanism, ``undetermined`` or known, and what its plant file leaves out."""
     said, model = [], found.model
     if undetermined:

@@ -13,7 +13,7 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.figures.figure import Figure
 from pendulum_bags.figures.render_files import write_figures
 from pendulum_bags.figures.table import Table
-from pendulum_bags.identification.mechanism_fit import MechanismFit
+from pendulum_bags.identification.joint_fit import JointFit
 from pendulum_bags.identification.model import UNITS
 from pendulum_bags.identification.problem import simulate
 from pendulum_bags.identification.result import ALARMS, IdentificationResult, PendulumResult
@@ -84,7 +84,7 @@ class _Motion:
 
 def _motions(result: IdentificationResult) -> Iterator[_Motion]:
     fit = result.fit
-    if isinstance(fit, MechanismFit):
+    if isinstance(fit, JointFit):
         unit = fit.model.plant.coordinates.drive_unit
         for name, part, errors in zip(result.training, fit.data, fit.residuals, strict=True):
             simulated, log = part.position + errors, part.recording

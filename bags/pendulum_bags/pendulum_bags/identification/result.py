@@ -18,9 +18,9 @@ from pendulum_bags.figures.table import Table
 from pendulum_bags.identification.covariance import FREQUENCY
 from pendulum_bags.identification.explained import REFUSED, Explained
 from pendulum_bags.identification.geometry import CONTRADICTION, GeometryCheck
+from pendulum_bags.identification.joint_fit import JointFit, Score
+from pendulum_bags.identification.joint_model import JointModel
 from pendulum_bags.identification.joint_recordings import JointRecording
-from pendulum_bags.identification.mechanism_fit import MechanismFit, Score
-from pendulum_bags.identification.mechanism_model import MechanismModel
 from pendulum_bags.identification.model import FRICTION_MODELS, PLANT_FRICTION_MODELS, UNITS, FitModel, to_plant
 from pendulum_bags.identification.notes import Interval
 from pendulum_bags.identification.output_error import OutputErrorFit
@@ -67,9 +67,10 @@ class IdentificationResult:
         created: Date, ISO 8601.
         data: Fingerprints of the recordings.
         notes: What is to be known of the recordings and of how they were fitted, in sentences.
+        excluding: That the recordings are of two machines, in a sentence; None where they may be of one.
     """
 
-    fit: OutputErrorFit | MechanismFit
+    fit: OutputErrorFit | JointFit
     choice: str
     candidates: Mapping[str, tuple[float | None, float | None]]
     uncertainty: Uncertainty
@@ -80,9 +81,10 @@ class IdentificationResult:
     created: str
     data: tuple[dict[str, Any], ...]
     notes: tuple[str, ...]
+    excluding: str | None
 
     @property
-    def model(self) -> FitModel | MechanismModel:
+    def model(self) -> FitModel | JointModel:
         """The fitted model."""
         return self.fit.model
 
@@ -104,7 +106,7 @@ class IdentificationResult:
     @property
     def incomplete(self) -> bool:
         """Whether the machine does something that no candidate model has, or that the fit does not explain."""
-        return self.explained.doubt is not None
+        return self.explained.incomplete is not None
 
     @property
     def verdict(self) -> str:
@@ -123,7 +125,7 @@ class IdentificationResult:
         return [*self._warnings(), *self.notes, *self._remarks(), *self.uncertainty.sentences]
 
     def _warnings(self) -> list[str]:
-        return [] if self.explained.doubt is None else [self.explained.doubt]
+        return [one for one in (self.excluding, self.explained.incomplete) if one is not None]
 
     def _remarks(self) -> list[str]:
         return []
@@ -134,7 +136,7 @@ class IdentificationResult:
         Raises:
             ParameterError: No body has the masses and inertias that were found.
         """
-        assert isinstance(self.fit, MechanismFit)
+        assert isinstance(self.fit, JointFit)
         return self.fit.model.identified(self.fit.free, name)
 
     def next_step(self, plant: str) -> tuple[str, str]:
@@ -152,7 +154,7 @@ class IdentificationResult:
         return f"{told.removesuffix('.')}:", command
 
     def _records(self) -> list[Mapping[str, Any]]:
-        assert isinstance(self.fit, MechanismFit)
+        assert isinstance(self.fit, JointFit)
         return [run_record(data.recording.meta) for data in self.fit.data]
 
     def tables(self) -> list[Table]:
@@ -240,7 +242,7 @@ class IdentificationResult:
         }
 
     def _own_values(self) -> dict[str, Any]:
-        assert isinstance(self.fit, MechanismFit)
+        assert isinstance(self.fit, JointFit)
         own = dict(zip(self.fit.own, self.fit.offsets.T.tolist(), strict=True))
         return {"mechanism": self.fit.model.plant.mechanism.name, "own_offsets": own}
 
@@ -288,14 +290,12 @@ class PendulumResult(IdentificationResult):
         tests: Of the residuals.
         geometry: Comparison with mass and length, None where they are unknown.
         moved_zeros: Held-out recordings whose zero lies elsewhere: by how much [rad], and their rms with it [rad].
-        excluding: That the recordings are of two machines, in a sentence; None where they may be of one.
     """
 
     fit: OutputErrorFit
     tests: ResidualTests
     geometry: GeometryCheck | None
     moved_zeros: Mapping[str, tuple[float, float]]
-    excluding: str | None
 
     @property
     def model(self) -> FitModel:
@@ -330,9 +330,8 @@ class PendulumResult(IdentificationResult):
         return ", apart from the windows named below" if self.tests.outliers else ""
 
     def _warnings(self) -> list[str]:
-        said = [self.excluding] if self.excluding is not None else []
-        said += self.geometry.sentences if self.geometry is not None else []
-        return [*said, *super()._warnings(), *self.tests.sentences[: self.tests.incomplete]]
+        geometry = () if self.geometry is None else self.geometry.sentences
+        return [*geometry, *super()._warnings(), *self.tests.sentences[: self.tests.incomplete]]
 
     def _remarks(self) -> list[str]:
         said = [

@@ -12,9 +12,9 @@ import numpy as np
 from pendulum_bags.arrays import Array
 from pendulum_bags.figures.figure import Figure, Panel, Trace
 from pendulum_bags.identification.explained import LARGEST_SHARE
+from pendulum_bags.identification.joint_fit import Score, fit, line_errors, prepare_windows
+from pendulum_bags.identification.joint_model import DELAY, LAG, JointModel
 from pendulum_bags.identification.joint_recordings import read_joints
-from pendulum_bags.identification.mechanism_fit import Score, fit, line_errors, prepare_windows
-from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel
 from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, common_delay, load_mechanism
@@ -105,7 +105,7 @@ def replay_joints(
     recording = read_joints(path, own.coordinates, mapping)
     recording.check(own.coordinates)
     lag = max((actuator.time_constant for actuator in own.actuators), default=0.0)
-    model = MechanismModel.of(own).with_changes({DELAY: common_delay(own), LAG: lag})
+    model = JointModel.of(own).with_changes({DELAY: common_delay(own), LAG: lag})
     data = prepare_windows(recording, window)
     weights = 1.0 / np.maximum(line_errors(data), 1e-9)
     found = fit(model, [data], (), weights, most=12, tolerance=1e-6)

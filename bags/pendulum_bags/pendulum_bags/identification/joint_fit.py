@@ -21,17 +21,17 @@ from numpy.typing import NDArray
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.arrowhead import Blocks, minimise
 from pendulum_bags.identification.covariance import Information, information
+from pendulum_bags.identification.joint_kernel import lagged, motion_kernel
+from pendulum_bags.identification.joint_model import DELAY, LAG, JointModel
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.kernel import cumulative_input
-from pendulum_bags.identification.mechanism_kernel import lagged, motion_kernel
-from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel
 from pendulum_bags.identification.problem import cut_windows, first_state, off_line, sensor_noise
 from pendulum_bags.recordings.clock import longest_step
 from pendulum_msgs_py.errors import DataError
 
 __all__ = [
     "MOST",
-    "MechanismFit",
+    "JointFit",
     "Score",
     "Windows",
     "error_weights",
@@ -220,7 +220,7 @@ def noise_of(position: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class MechanismFit:
+class JointFit:
     """A fit.
 
     Attributes:
@@ -235,7 +235,7 @@ class MechanismFit:
         offsets: Those values, shape (recordings, m).
     """
 
-    model: MechanismModel
+    model: JointModel
     free: tuple[str, ...]
     states: list[Array]
     cost: float
@@ -245,13 +245,13 @@ class MechanismFit:
     own: tuple[str, ...]
     offsets: Array
 
-    def again(self, weights: Array, **changes: Any) -> MechanismFit:
+    def again(self, weights: Array, **changes: Any) -> JointFit:
         """Return the fit from here under other weights, and with other arguments of :func:`fit`."""
         start = {"model": self.model, "data": self.data, "free": self.free, "states": self.states}
         return fit(weights=weights, **{**start, "own": self.own, "offsets": self.offsets, **changes})
 
     @property
-    def models(self) -> list[MechanismModel]:
+    def models(self) -> list[JointModel]:
         """The model of each recording, with its own offsets."""
         return [self.model.with_changes(dict(zip(self.own, row, strict=True))) for row in self.offsets]
 
@@ -287,7 +287,7 @@ class MechanismFit:
         return max(score.share for score in self.scores)
 
 
-def _motions(model: MechanismModel, values: Array, data: Windows, states: Array) -> Array:
+def _motions(model: JointModel, values: Array, data: Windows, states: Array) -> Array:
     """Return motions, shape (c, w, l, 2 n), of values (c, parameters) and start states (c, w, 2 n)."""
     pairs, which = np.unique(values[:, model.index((DELAY, LAG))], axis=0, return_inverse=True)
     drive = np.array([data.input(*pair) for pair in pairs])
@@ -298,7 +298,7 @@ def _motions(model: MechanismModel, values: Array, data: Windows, states: Array)
     return path
 
 
-def _sensitivity(model: MechanismModel, names: Sequence[str], data: Windows, states: Array, path: Array) -> Array:
+def _sensitivity(model: JointModel, names: Sequence[str], data: Windows, states: Array, path: Array) -> Array:
     """Return those of a motion to parameters and start states, shape (w, l, 2 n, k + 2 n)."""
     index, width = model.index(names), states.shape[1]
     steps = np.array([*(_DIFFERENCE * model.size(name) for name in names), *[_DIFFERENCE] * width])
@@ -328,24 +328,22 @@ class _Motion:
     weights: Array
     last: tuple[Array, Array, Array] | None = None
 
-    def _path(self, model: MechanismModel, states: Array) -> Array:
+    def _path(self, model: JointModel, states: Array) -> Array:
         last = self.last
         if last is None or not (np.array_equal(last[0], model.vector) and np.array_equal(last[1], states)):
             path = _motions(model, model.vector[None], self.part, states[None])[0]
             self.last = last = (model.vector, states, path)
         return last[2]
 
-    def cost(self, model: MechanismModel, states: Array) -> float:
+    def cost(self, model: JointModel, states: Array) -> float:
         path = self._path(model, states)
         return float(np.sum((_errors(self.part, path) * self.weights) ** 2)) if np.isfinite(path).all() else np.inf
 
-    def sensitivities(
-        self, model: MechanismModel, states: Array, names: Sequence[str]
-    ) -> tuple[list[Array], list[Array]]:
+    def sensitivities(self, model: JointModel, states: Array, names: Sequence[str]) -> tuple[list[Array], list[Array]]:
         flat, errors = self._sensitivities(model, states, names)
         return list(flat), list(errors)
 
-    def _sensitivities(self, model: MechanismModel, states: Array, names: Sequence[str]) -> tuple[Array, Array]:
+    def _sensitivities(self, model: JointModel, states: Array, names: Sequence[str]) -> tuple[Array, Array]:
         """Return those of each window to parameters and states, shape (w, i, k + 2 n), and the errors, shape (w, i)."""
         path, part = self._path(model, states), self.part
         own = self.weights * np.repeat([1.0, float(part.velocity is not None)], part.position.shape[-1])
@@ -353,7 +351,7 @@ class _Motion:
         flat, errors = scaled.reshape(len(path), -1, scaled.shape[-1]), _errors(part, path) * self.weights
         return flat, errors.reshape(len(path), -1)
 
-    def linearise(self, model: MechanismModel, states: Array, names: Sequence[str]) -> tuple[float, Blocks]:
+    def linearise(self, model: JointModel, states: Array, names: Sequence[str]) -> tuple[float, Blocks]:
         k, (w, x) = len(names), states.shape
         blocks, cost = Blocks.zeros(k, w, x), self.cost(model, states)
         if math.isfinite(cost):
@@ -369,7 +367,7 @@ class _Motion:
 # Far along an unstable motion sensitivities overflow; what is not finite is refused.
 @np.errstate(over="ignore", invalid="ignore")
 def fit(
-    model: MechanismModel,
+    model: JointModel,
     data: Sequence[Windows],
     free: Sequence[str],
     weights: Array,
@@ -380,7 +378,7 @@ def fit(
     most: int = MOST,
     tolerance: float = 1e-6,
     hopeless: float = np.inf,
-) -> MechanismFit:
+) -> JointFit:
     """Minimise the weighted squares of the errors over free parameters and start states, as :func:`minimise` does.
 
     ``weights`` are of each joint's error, shape (n,), or of its position and its velocity, shape (2 n,); the start
@@ -406,11 +404,11 @@ def fit(
     if not math.isfinite(found.cost):
         raise DataError(_AWAY)
     rest = found.states, found.cost, found.converged, data, weights, tuple(own), found.own
-    return MechanismFit(found.model, tuple(free), *rest)
+    return JointFit(found.model, tuple(free), *rest)
 
 
 def scores(
-    model: MechanismModel, data: Sequence[Windows], weights: Array | None = None, *, own: Sequence[str] = ()
+    model: JointModel, data: Sequence[Windows], weights: Array | None = None, *, own: Sequence[str] = ()
 ) -> list[Score]:
     """Return how well a model explains each recording, with the start of each window and its ``own`` offsets fitted.
 
@@ -423,7 +421,7 @@ def scores(
     return found
 
 
-def window_length(model: MechanismModel, recordings: Sequence[JointRecording], longest: float) -> float:
+def window_length(model: JointModel, recordings: Sequence[JointRecording], longest: float) -> float:
     """Return the longest window over which motions that begin close to each other stay near, up to ``longest`` [s].
 
     Along the measured motion the equation, linearised and without dry friction (which hides an unstable equilibrium as
@@ -476,7 +474,7 @@ def first_weights(data: Sequence[Windows]) -> Array:
     return 1.0 / np.maximum(size, 1e-9)
 
 
-def error_weights(found: MechanismFit) -> Array:
+def error_weights(found: JointFit) -> Array:
     """Return weights of positions and velocities by the errors of a fit, 0 for what was not measured."""
     data = found.data
     squares = np.mean([rms_by_joint(e, part) ** 2 for e, part in zip(found.errors, data, strict=True)], axis=0)

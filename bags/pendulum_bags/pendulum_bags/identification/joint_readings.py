@@ -10,14 +10,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED
-from pendulum_bags.identification.mechanism_fit import MechanismFit, Score, Windows, first_weights, fit, noise_of
-from pendulum_bags.identification.mechanism_model import DELAY, MechanismModel, tellable
+from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED, Explained
+from pendulum_bags.identification.joint_fit import MOST, JointFit, Score, Windows, first_weights, fit, noise_of
+from pendulum_bags.identification.joint_model import DELAY, JointModel, tellable
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE
-from pendulum_msgs_py.errors import DataError
+from pendulum_bags.identification.residual_tests import INCOMPLETE
+from pendulum_bags.identification.uncertainty import Uncertainty
+from pendulum_msgs_py.errors import DataError, ParameterError
+from pendulum_msgs_py.plants.determined import undetermined
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["better_reading", "far_off", "refusal"]
+__all__ = ["better_reading", "explained_joints", "far_off", "refusal", "undetermined_joints"]
 
 _BETTER = 0.5
 """Another reading of the recording explains better where it misses less than this share of what the fit misses."""
@@ -102,7 +105,7 @@ def _readings(plant: PlantParameters, data: Sequence[Windows]) -> Iterator[_Read
         yield _Reading(words, advice, unit, unit, math.pi * unit[i])
 
 
-def refusal(found: MechanismFit, training: Mapping[str, Score], held_out: Mapping[str, Score]) -> str | None:
+def refusal(found: JointFit, training: Mapping[str, Score], held_out: Mapping[str, Score]) -> str | None:
     """Return why a fit is no model of the machine, by its scores, in a sentence; None where it may be one."""
     plant, data = found.model.plant, found.data
     far = far_off(found)
@@ -127,10 +130,39 @@ def refusal(found: MechanismFit, training: Mapping[str, Score], held_out: Mappin
                 f"{100.0 * LARGEST_SHARE:.0f} %. No other order, sign, unit or zero of the columns explains it better: "
                 "something that was not recorded moves the machine, or it is another one"
             )
+    if far is None and not found.converged:
+        return f"{REFUSED}: the search had not ended after {MOST} steps; expected a start nearer to the machine"
     return far
 
 
-def far_off(found: MechanismFit) -> str | None:
+def explained_joints(found: JointFit, refused: str | None) -> Explained:
+    """Return how much of the motion a fit explains."""
+    incomplete = None
+    if refused is None and found.worst > DOUBTFUL_SHARE:
+        incomplete = (
+            f"{INCOMPLETE}: the model misses up to {100.0 * found.worst:.0f} % of what straight lines miss: something "
+            "acts on the machine that is not in it."
+        )
+    rms, lines = (
+        tuple(np.sqrt(np.mean(np.square(values), axis=0)).tolist())
+        for values in zip(*((one.rms, one.lines) for one in found.scores), strict=True)
+    )
+    return Explained(rms, lines, found.worst, refused, incomplete, found.model.plant.coordinates.joints)
+
+
+def undetermined_joints(found: JointFit, uncertainty: Uncertainty) -> str | None:
+    """Return the sentence that the recordings do not determine what a plant file needs; None where they do."""
+    intervals, unit = uncertainty.intervals, found.model.unit
+    try:
+        identified = found.model.identified(found.free, found.model.plant.name)
+    except ParameterError as error:
+        return f"{REFUSED}: {error}"
+    ends = {name: (one.low, one.high) for name, one in intervals.items()}
+    lost = [f"{name} ({intervals[name].text} {unit(name)})" for name in undetermined(identified, ends)]
+    return f"{REFUSED}: the recordings do not determine {', '.join(lost)}" if lost else None
+
+
+def far_off(found: JointFit) -> str | None:
     """Return the first fitted size that is not that of a machine near the start, in a sentence; None without one."""
     plant = found.model.plant
     for name in tellable(plant):
@@ -145,7 +177,7 @@ def far_off(found: MechanismFit) -> str | None:
     return None
 
 
-def better_reading(plant: PlantParameters, data: Sequence[Windows], found: MechanismFit | None = None) -> str | None:
+def better_reading(plant: PlantParameters, data: Sequence[Windows], found: JointFit | None = None) -> str | None:
     """Return how the columns are to be read, with what mends it, where that alone explains the motion; else None.
 
     Each reading is fitted to a few short windows, and so is the given one: a fit that ended in a poor minimum is no
@@ -181,7 +213,7 @@ def _fits(plant: PlantParameters, reading: _Reading, data: Sequence[Windows]) ->
     The delay of a loop of 500 Hz, 5 ms, hides the sign of an effort that balances a machine: it is fitted, too.
     """
     others = [reading.of(part) for part in data]
-    model, weights = MechanismModel.of(plant), first_weights(others)
+    model, weights = JointModel.of(plant), first_weights(others)
     free, shares = model.fitted(), [math.inf]
     with suppress(DataError, np.linalg.LinAlgError):
         shares.append(_share(fit(model, others, free, weights, most=15, tolerance=1e-3)))
@@ -192,5 +224,5 @@ def _fits(plant: PlantParameters, reading: _Reading, data: Sequence[Windows]) ->
     return min(shares)
 
 
-def _share(found: MechanismFit) -> float:
+def _share(found: JointFit) -> float:
     return math.inf if far_off(found) is not None else float(np.mean([score.share for score in found.scores]))

@@ -21,7 +21,7 @@ from pendulum_bags.identification.arrowhead import Prior
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pack_joints
 
-__all__ = ["DELAY", "LAG", "MechanismModel", "tellable"]
+__all__ = ["DELAY", "LAG", "JointModel", "tellable"]
 
 DELAY = "delay"
 """Time from the recorded effort to its effect, negative where the effort is recorded late [s]."""
@@ -42,7 +42,7 @@ _WEAK = 1e-3
 
 
 @dataclass(frozen=True)
-class MechanismModel:
+class JointModel:
     """A mechanism with the numbers of a fit.
 
     Attributes:
@@ -61,7 +61,7 @@ class MechanismModel:
         return (*self.plant.mechanism.parameter_names, *extra, DELAY, LAG)
 
     @classmethod
-    def of(cls, plant: PlantParameters) -> MechanismModel:
+    def of(cls, plant: PlantParameters) -> JointModel:
         """Return the model that a plant file makes."""
         joints = plant.joints
         zeros = [0.0] * (2 * len(joints) + 2)
@@ -76,11 +76,11 @@ class MechanismModel:
         """Return a value by name."""
         return float(self.vector[self.names.index(name)])
 
-    def with_vector(self, vector: Array) -> MechanismModel:
+    def with_vector(self, vector: Array) -> JointModel:
         """Return the model with other values."""
-        return MechanismModel(self.plant, np.array(vector, dtype=float))
+        return JointModel(self.plant, np.array(vector, dtype=float))
 
-    def with_changes(self, changes: Mapping[str, float]) -> MechanismModel:
+    def with_changes(self, changes: Mapping[str, float]) -> JointModel:
         """Return the model with some values changed."""
         vector = self.vector.copy()
         vector[self.index(list(changes))] = list(changes.values())
@@ -106,11 +106,11 @@ class MechanismModel:
 
     def prior(self, names: Sequence[str]) -> Prior:
         """Return what the plant file knows of some parameters."""
-        start = MechanismModel.of(self.plant)
+        start = JointModel.of(self.plant)
         known = np.array([start[name] for name in names])
         return Prior(known, np.array([self.spread(name) for name in names]) ** -2.0)
 
-    def within_reach(self, _other: MechanismModel) -> bool:
+    def within_reach(self, _other: JointModel) -> bool:
         """Return that a step may lead anywhere within bounds."""
         return True
 
@@ -120,7 +120,7 @@ class MechanismModel:
 
     def size(self, name: str) -> float:
         """Return a scale of a parameter, in its unit, so that steps and ranks do not depend on units."""
-        value = abs(float(MechanismModel.of(self.plant)[name]))
+        value = abs(float(JointModel.of(self.plant)[name]))
         if value > 0.0:
             return value
         return {DELAY: 0.01, LAG: 1e-3}.get(name, 0.01 if name.endswith("offset") else 1e-3)
@@ -192,7 +192,7 @@ def tellable(plant: PlantParameters) -> tuple[str, ...]:
         Gautier and Khalil, Direct calculation of minimum set of inertial parameters of serial robots, IEEE Trans.
         Robotics and Automation 6(3), 1990 (base parameters; by random states: Gautier 1991).
     """
-    model = MechanismModel.of(plant)
+    model = JointModel.of(plant)
     own = [spec for spec in plant.mechanism.parameters if spec.unit in _ORDER and model.spread(spec.name) > 0.0]
     own.sort(key=lambda spec: (model.spread(spec.name) < np.inf, _ORDER.index(spec.unit)))
     damping = list(plant.mechanism.parameter_names[len(plant.mechanism.parameters) :])
