@@ -33,6 +33,7 @@ __all__ = [
     "eliminate",
     "find_states",
     "minimise",
+    "robust_cost",
 ]
 
 _STUCK, _PROGRESS = 10, 0.99
@@ -81,9 +82,7 @@ M = TypeVar("M", bound="Model")
 class Model(Protocol):
     """Parameters of a simulation, by name and as a vector."""
 
-    @property
-    def vector(self) -> Array:
-        """All values, shape (p,)."""
+    vector: Array
 
     def __getitem__(self, name: str) -> float:
         """Return one value."""
@@ -102,9 +101,11 @@ class Model(Protocol):
 
     def prior(self, names: Sequence[str]) -> Prior:
         """Return what is known of some parameters beforehand."""
+        return Prior(np.zeros(len(names)), np.zeros(len(names)))
 
-    def within_reach(self: M, other: M) -> bool:
+    def within_reach(self: M, _other: M) -> bool:
         """Return whether one step may lead from here to another model."""
+        return True
 
 
 _M_contra = TypeVar("_M_contra", contravariant=True)
@@ -113,16 +114,50 @@ _M_contra = TypeVar("_M_contra", contravariant=True)
 class Motion(Protocol[_M_contra]):
     """The errors of one recording, cut into windows, under a model."""
 
-    def cost(self, model: _M_contra, states: Array) -> float:
-        """Return the loss, inf where the motion leaves all bounds; states have the shape (w, x)."""
+    @property
+    def scale(self) -> float:
+        """Error at which the loss turns from quadratic to linear; inf for least squares."""
 
-    def sensitivities(
-        self, model: _M_contra, states: Array, names: Sequence[str]
-    ) -> tuple[Sequence[Array], Sequence[Array]]:
-        """Return by window those to parameters and states, shape (n, k + x), and the errors, shape (n,)."""
+    def errors(self, model: _M_contra, states: Array) -> Array:
+        """Return the errors in all windows; states have the shape (w, x)."""
 
-    def linearise(self, model: _M_contra, states: Array, names: Sequence[str]) -> tuple[float, Blocks]:
-        """Return loss and normal equations; the loss is inf where a derivative overflows."""
+    def sensitivities(self, model: _M_contra, states: Array, names: Sequence[str]) -> tuple[Array, Array, list[int]]:
+        """Return those to parameters and states, shape (n, k + x), the errors (n,), and where windows begin and end."""
+
+
+def robust_cost(errors: Array, scale: float) -> float:
+    """Return the soft-L1 loss, sum of 2 s^2 (sqrt(1 + (r/s)^2) - 1), of errors; s = inf gives the sum of squares."""
+    if not math.isfinite(scale):
+        return float(errors @ errors)
+    ratio = errors / scale
+    return float(2.0 * scale * scale * np.sum(np.sqrt(1.0 + ratio * ratio) - 1.0))
+
+
+def _loss(motion: Motion[M], model: M, states: Array) -> float:
+    errors = motion.errors(model, states)
+    return robust_cost(errors, motion.scale) if np.isfinite(errors).all() else np.inf
+
+
+def _normal_equations(motion: Motion[M], model: M, states: Array, names: Sequence[str]) -> tuple[float, Blocks]:
+    """Return loss and normal equations of one recording; the loss is inf where a derivative overflows."""
+    sensitivity, errors, ends = motion.sensitivities(model, states, names)
+    loss, (k, width) = robust_cost(errors, motion.scale), (len(names), sensitivity.shape[1])
+    if math.isfinite(motion.scale):
+        root = (1.0 + (errors / motion.scale) ** 2) ** -0.25
+        sensitivity, errors = sensitivity * root[:, None], errors * root
+    matrix, gradient = np.empty((len(states), width, width)), np.empty((len(states), width))
+    for n, (a, b) in enumerate(itertools.pairwise(ends)):
+        part = sensitivity[a:b]
+        np.matmul(part.T, part, out=matrix[n])
+        np.matmul(errors[a:b], part, out=gradient[n])
+    blocks = Blocks(
+        matrix[:, :k, :k].sum(axis=0),
+        matrix[:, :k, k:],
+        matrix[:, k:, k:],
+        gradient[:, :k].sum(axis=0),
+        gradient[:, k:],
+    )
+    return (loss if math.isfinite(float(matrix.sum())) else np.inf), blocks
 
 
 @dataclass(frozen=True)
@@ -183,7 +218,7 @@ def minimise(
     def linearise() -> tuple[float, Blocks]:
         blocks, cost = Blocks.zeros(len(names), ends[-1], x[0].shape[1] if count > 1 else 0), prior.cost(found)
         for one, motion, at, state, (a, b) in zip(best, motions, columns, x, itertools.pairwise(ends), strict=True):
-            loss, part = motion.linearise(one, state, (*free, *own))
+            loss, part = _normal_equations(motion, one, state, (*free, *own))
             if not math.isfinite(loss):
                 return np.inf, blocks
             cost += loss
@@ -227,7 +262,7 @@ def minimise(
         x_trial = [state + d_x[a:b] for state, (a, b) in zip(x, itertools.pairwise(ends), strict=True)]
         new_cost = prior.cost(trial)
         for one, motion, state in zip(candidates, motions, x_trial, strict=True):
-            new_cost += motion.cost(one, state)
+            new_cost += _loss(motion, one, state)
         if new_cost < cost:
             before, current = (found, best, x, cost, blocks), False
             good = (cost - new_cost) / max(gain, 1e-300) > 0.25

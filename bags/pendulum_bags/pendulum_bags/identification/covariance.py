@@ -81,14 +81,15 @@ def information(
     """Return what the motions of recordings show of free parameters; each recording has its ``own`` ones beside."""
     k, projected, residuals = len(free), list[list[Array]](), list[list[Array]]()
     for model, motion, x in zip(models, motions, states, strict=True):
-        sensitivities, errors = motion.sensitivities(model, x, (*free, *own))
-        rest = [without(each[:, k + len(own) :], each[:, : k + len(own)]) for each in sensitivities]
+        sensitivity, errors, ends = motion.sensitivities(model, x, (*free, *own))
+        parts = [sensitivity[a:b] for a, b in itertools.pairwise(ends)]
+        rest = [without(each[:, k + len(own) :], each[:, : k + len(own)]) for each in parts]
         if own:
             stacked = np.concatenate(rest)
             follow = np.linalg.lstsq(stacked[:, k:], stacked[:, :k], rcond=None)[0]
             rest = [each[:, :k] - each[:, k:] @ follow for each in rest]
         projected.append(rest)
-        residuals.append(list(errors))
+        residuals.append([errors[a:b] for a, b in itertools.pairwise(ends)])
     return Information(projected, residuals)
 
 

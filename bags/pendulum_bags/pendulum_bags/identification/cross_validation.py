@@ -5,14 +5,16 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.identification.arrowhead import robust_cost
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.identification.problem import Piece, simulate
-from pendulum_bags.identification.solver import Solution, robust_cost, solve
+from pendulum_bags.identification.solver import Solution, solve
 from pendulum_bags.identification.window_score import fit_states
 
 __all__ = ["COARSE", "CrossValidation", "cross_validate", "folds"]
@@ -22,6 +24,11 @@ COARSE = 3.0
 
 _SCALED = ("inertia", "damping", "gravity", "coulomb_friction", "stribeck_excess")
 _DRY = ("damping", "coulomb_friction", "stribeck_excess", "load_friction")
+
+
+class _Cut(Protocol):
+    @property
+    def states(self) -> Array: ...
 
 
 @dataclass(frozen=True)
@@ -39,12 +46,12 @@ class CrossValidation:
     vectors: Array
 
 
-def folds(pieces: Sequence[Piece], count: int = 6) -> list[list[NDArray[np.int64]]]:
+def folds(pieces: Sequence[_Cut], count: int = 6) -> list[list[NDArray[np.int64]]]:
     """Return, by fold, the held-out window indices of each piece; contiguous blocks over the whole of the data.
 
     Neighbouring windows share slow disturbances: scattered folds would leak them into the training part.
     """
-    sizes = [len(piece.windows) for piece in pieces]
+    sizes = [len(piece.states) for piece in pieces]
     number = min(count, sum(sizes))
     if number < 2:
         return []

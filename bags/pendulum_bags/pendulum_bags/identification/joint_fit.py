@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.identification.arrowhead import Blocks, minimise
+from pendulum_bags.identification.arrowhead import minimise
 from pendulum_bags.identification.covariance import Information, information
 from pendulum_bags.identification.joint_kernel import lagged, motion_kernel
 from pendulum_bags.identification.joint_model import DELAY, LAG, JointModel
@@ -327,6 +327,7 @@ class _Motion:
     part: Windows
     weights: Array
     last: tuple[Array, Array, Array] | None = None
+    scale: float = math.inf
 
     def _path(self, model: JointModel, states: Array) -> Array:
         last = self.last
@@ -335,33 +336,15 @@ class _Motion:
             self.last = last = (model.vector, states, path)
         return last[2]
 
-    def cost(self, model: JointModel, states: Array) -> float:
-        path = self._path(model, states)
-        return float(np.sum((_errors(self.part, path) * self.weights) ** 2)) if np.isfinite(path).all() else np.inf
+    def errors(self, model: JointModel, states: Array) -> Array:
+        return np.ravel(_errors(self.part, self._path(model, states)) * self.weights)
 
-    def sensitivities(self, model: JointModel, states: Array, names: Sequence[str]) -> tuple[list[Array], list[Array]]:
-        flat, errors = self._sensitivities(model, states, names)
-        return list(flat), list(errors)
-
-    def _sensitivities(self, model: JointModel, states: Array, names: Sequence[str]) -> tuple[Array, Array]:
-        """Return those of each window to parameters and states, shape (w, i, k + 2 n), and the errors, shape (w, i)."""
+    def sensitivities(self, model: JointModel, states: Array, names: Sequence[str]) -> tuple[Array, Array, list[int]]:
         path, part = self._path(model, states), self.part
         own = self.weights * np.repeat([1.0, float(part.velocity is not None)], part.position.shape[-1])
         scaled = _sensitivity(model, names, part, states, path) * (part.inside[..., None] * own)[..., None]
-        flat, errors = scaled.reshape(len(path), -1, scaled.shape[-1]), _errors(part, path) * self.weights
-        return flat, errors.reshape(len(path), -1)
-
-    def linearise(self, model: JointModel, states: Array, names: Sequence[str]) -> tuple[float, Blocks]:
-        k, (w, x) = len(names), states.shape
-        blocks, cost = Blocks.zeros(k, w, x), self.cost(model, states)
-        if math.isfinite(cost):
-            flat, errors = self._sensitivities(model, states, names)
-            matrix, gradient = flat.transpose(0, 2, 1) @ flat, np.einsum("wia,wi->wa", flat, errors)
-            if not np.isfinite(matrix).all():
-                return np.inf, blocks
-            h_pp, g_p = matrix[:, :k, :k].sum(axis=0), gradient[:, :k].sum(axis=0)
-            blocks = Blocks(h_pp, matrix[:, :k, k:], matrix[:, k:, k:], g_p, gradient[:, k:])
-        return cost, blocks
+        errors = np.ravel(_errors(part, path) * self.weights)
+        return scaled.reshape(-1, scaled.shape[-1]), errors, list(range(0, errors.size + 1, errors.size // len(path)))
 
 
 # Far along an unstable motion sensitivities overflow; what is not finite is refused.

@@ -17,7 +17,7 @@ from functools import lru_cache
 import numpy as np
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.identification.arrowhead import Prior
+from pendulum_bags.identification.arrowhead import Model, Prior
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pack_joints
 
@@ -42,7 +42,7 @@ _WEAK = 1e-3
 
 
 @dataclass(frozen=True)
-class JointModel:
+class JointModel(Model):
     """A mechanism with the numbers of a fit.
 
     Attributes:
@@ -109,10 +109,6 @@ class JointModel:
         start = JointModel.of(self.plant)
         known = np.array([start[name] for name in names])
         return Prior(known, np.array([self.spread(name) for name in names]) ** -2.0)
-
-    def within_reach(self, _other: JointModel) -> bool:
-        """Return that a step may lead anywhere within bounds."""
-        return True
 
     def spread(self, name: str) -> float:
         """Return the standard deviation with which the plant file knows a parameter; inf where it does not count."""

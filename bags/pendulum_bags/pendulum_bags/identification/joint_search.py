@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.identification.cross_validation import folds
 from pendulum_bags.identification.explained import LARGEST_SHARE
 from pendulum_bags.identification.joint_fit import (
     JointFit,
@@ -140,20 +141,16 @@ def _held_out_error(found: JointFit, data: Sequence[Windows], weights: Array) ->
     The parameters without a fold are one Gauss-Newton step from those of all data, where their gradient is known.
     """
     size = np.array([found.model.size(name) for name in found.free])
+    parts = folds(data, 3)
     if len(data) > 1:
-        folds = [
-            [np.arange(len(p.time)) if i == j else np.zeros(0, dtype=int) for j, p in enumerate(data)]
-            for i in range(len(data))
-        ]
-    else:
-        folds = [[part] for part in np.array_split(np.arange(len(data[0].time)), 3)]
+        parts = [[np.arange(len(p.time) * (p is left_out)) for p in data] for left_out in data]
     cost, samples, seen = 0.0, 0, found.information
-    for fold in folds:
+    for fold in parts:
         matrix, gradient = np.zeros((len(size), len(size))), np.zeros(len(size))
-        for parts, errors, out in zip(seen.projected, seen.residual, fold, strict=True):
-            for i in np.setdiff1d(np.arange(len(parts)), out):
-                matrix += parts[i].T @ parts[i]
-                gradient += parts[i].T @ errors[i]
+        for effects, errors, out in zip(seen.projected, seen.residual, fold, strict=True):
+            for i in np.setdiff1d(np.arange(len(effects)), out):
+                matrix += effects[i].T @ effects[i]
+                gradient += effects[i].T @ errors[i]
         step = size * (np.linalg.pinv(matrix * np.outer(size, size), rcond=1e-10) @ (size * gradient))
         moved = {n: max(found.model[n] - d, found.model.bounds(n)[0]) for n, d in zip(found.free, step, strict=True)}
         model = found.model.with_changes(moved)
@@ -183,8 +180,8 @@ class Found:
     extras: str
     candidates: dict[str, float]
     length: float
-    parted: bool
-    pushed: list[tuple[str, float, float]]
+    parted: bool = False
+    pushed: Sequence[tuple[str, float, float]] = ()
 
 
 def search(
@@ -210,15 +207,7 @@ def search(
     # Now that the errors are known, each measurement counts by its own; of a fit to be refused none does.
     for _ in range(0 if found.worst > LARGEST_SHARE else 2 if measured else 1):
         found = found.again(error_weights(found))
-    return Found(found, best.extras, best.candidates, best.length, window is None and best.length < longest, pushed)
-
-
-@dataclass(frozen=True)
-class _Attempt:
-    fit: JointFit
-    extras: str
-    candidates: dict[str, float]
-    length: float
+    return replace(best, fit=found, parted=window is None and best.length < longest, pushed=pushed)
 
 
 @dataclass(frozen=True)
@@ -230,7 +219,7 @@ class _Search:
     extras: str | None
     stride: int
 
-    def best(self, length: float, *, fixed: bool) -> _Attempt:
+    def best(self, length: float, *, fixed: bool) -> Found:
         """Return the best fit to windows of a length [s], or to shorter ones unless it is fixed.
 
         Raises:
@@ -239,23 +228,23 @@ class _Search:
         start = JointModel.of(self.plant)
         data = self._windows(length)
         first = self._attempt(start, data, length)
-        tried = [first] if isinstance(first, _Attempt) else []
+        tried = [first] if isinstance(first, Found) else []
         # A minimum that is not poor has values of no machine where the search began far below the delay.
         well = tried and tried[0].fit.worst <= _POOR and far_off(tried[0].fit) is None
         if DELAY in (self.extras or DELAY) and not well and (late := self._late(start, data)) is not None:
             start = late
             again = self._attempt(start, data, length)
-            tried += [again] if isinstance(again, _Attempt) else []
+            tried += [again] if isinstance(again, Found) else []
         shortest = None
         for shorter in (length / 3.0, length / 9.0):
             if (tried and min(one.fit.worst for one in tried) <= _POOR) or shorter < _SHORTEST:
                 break
             # Short windows have fewer minima: what they find is another start.
             near = self._attempt(start, self._windows(shorter), shorter)
-            if not isinstance(near, _Attempt) or near.fit.worst > DOUBTFUL_SHARE:
+            if not isinstance(near, Found) or near.fit.worst > DOUBTFUL_SHARE:
                 continue
             again = self._attempt(near.fit.model, data, length)
-            tried += [again] if isinstance(again, _Attempt) else []
+            tried += [again] if isinstance(again, Found) else []
             shortest = None if fixed else near
         best = min(tried, key=lambda one: one.fit.worst) if tried else None
         # What long windows show, if poorly, predicts better than what short ones do.
@@ -286,9 +275,9 @@ class _Search:
             )
         return data
 
-    def _attempt(self, start: JointModel, data: list[Windows], length: float) -> _Attempt | DataError:
+    def _attempt(self, start: JointModel, data: list[Windows], length: float) -> Found | DataError:
         try:
-            return _Attempt(*_choose(start, data, first_weights(data), self.extras), length)
+            return Found(*_choose(start, data, first_weights(data), self.extras), length)
         except DataError as error:
             return error
 

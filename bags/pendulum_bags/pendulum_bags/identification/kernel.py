@@ -37,7 +37,7 @@ from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, added_fricti
 from pendulum_msgs_py.programs.kernel_cache import drop_stale_code
 from pendulum_sim.stepping.dry_friction import LAG, PACKED
 
-__all__ = ["PARAMETER_NAMES", "cumulative_input", "normal_blocks", "simulate_windows"]
+__all__ = ["PARAMETER_NAMES", "cumulative_input", "simulate_windows"]
 
 PARAMETER_NAMES = (
     # Those of a plant but its lag, which a fit counts as delay; of static friction what exceeds the sliding one.
@@ -309,42 +309,5 @@ def simulate_windows(
                 jacobian[i, :] = dth
 
 
-@njit(cache=True)
-def normal_blocks(
-    jacobian: Array,
-    residual: Array,
-    weight: Array,
-    windows: Any,
-    h_pp: Array,
-    h_px: Array,
-    h_xx: Array,
-    g_p: Array,
-    g_x: Array,
-) -> None:
-    """Add the normal equations of one recording to the blocks of :class:`~arrowhead.Blocks`.
-
-    Sensitivities have the shape (n, k + 2), residuals and weights (n,), windows (w, 2).
-    """
-    k = g_p.size
-    for n in range(windows.shape[0]):
-        for i in range(windows[n, 0], windows[n, 1]):
-            row = jacobian[i]
-            for a in range(k):
-                wa = weight[i] * row[a]
-                g_p[a] += wa * residual[i]
-                for b in range(a + 1):
-                    h_pp[a, b] += wa * row[b]
-                h_px[n, a, 0] += wa * row[k]
-                h_px[n, a, 1] += wa * row[k + 1]
-            for a in range(2):
-                wa = weight[i] * row[k + a]
-                g_x[n, a] += wa * residual[i]
-                h_xx[n, a, 0] += wa * row[k]
-                h_xx[n, a, 1] += wa * row[k + 1]
-    for a in range(k):
-        for b in range(a):
-            h_pp[b, a] = h_pp[a, b]
-
-
-for _kernel in (cumulative_input, simulate_windows, normal_blocks):
+for _kernel in (cumulative_input, simulate_windows):
     drop_stale_code(_kernel, [*friction_terms.modules(), rigid])

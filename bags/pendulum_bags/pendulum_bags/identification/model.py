@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.identification.arrowhead import Prior
+from pendulum_bags.identification.arrowhead import Model
 from pendulum_bags.identification.kernel import PARAMETER_NAMES
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.friction_terms import FRICTION_TERMS
@@ -112,7 +112,7 @@ _DEFAULTS |= {name: default for name, (default, _) in _FURTHER.items()}
 
 
 @dataclass(frozen=True)
-class FitModel:
+class FitModel(Model):
     """Parameter values of the fit model; what drives it says ``input_kind``.
 
     Args:
@@ -179,10 +179,6 @@ class FitModel:
     def size(self, name: str) -> float:
         """Return a scale of a parameter, in its unit."""
         return _SIZES.get(name, 1.0)
-
-    def prior(self, names: Sequence[str]) -> Prior:
-        """Return that nothing is known beforehand."""
-        return Prior(np.zeros(len(names)), np.zeros(len(names)))
 
     def within_reach(self, other: FitModel) -> bool:
         """Return whether the inertia, which is never negative, changes fourfold at most."""

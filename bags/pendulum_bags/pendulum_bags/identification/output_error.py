@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.identification.arrowhead import robust_cost
 from pendulum_bags.identification.cross_validation import COARSE, cross_validate
 from pendulum_bags.identification.model import FRICTION_MODELS, FURTHER_TERMS, SERVO_ONLY, FitModel
 from pendulum_bags.identification.options import DEFAULTS, Geometry, Options, default_window
@@ -15,7 +16,7 @@ from pendulum_bags.identification.own_offsets import OwnOffsets, align
 from pendulum_bags.identification.problem import Piece, prepare
 from pendulum_bags.identification.readings import misfit_cause
 from pendulum_bags.identification.selection import Candidate, by_window, choose, effective_samples
-from pendulum_bags.identification.solver import Solution, refine, residuals, robust_cost, solve
+from pendulum_bags.identification.solver import Solution, refine, residuals, solve
 from pendulum_bags.identification.starts import first_models, rank
 from pendulum_bags.runs.datasets import Recording
 from pendulum_msgs_py.errors import DataError

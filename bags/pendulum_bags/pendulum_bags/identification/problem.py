@@ -60,6 +60,12 @@ class Piece:
         return Piece(self.recording, self.windows[index], self.states[index], self.integral, self.enabled)
 
     @cached_property
+    def rows(self) -> slice | NDArray[np.bool_]:
+        """Index of the samples in windows; without a copy where the windows follow one another."""
+        follow = np.array_equal(self.windows[1:, 0], self.windows[:-1, 1])
+        return slice(int(self.windows[0, 0]), int(self.windows[-1, 1])) if follow else self.mask
+
+    @cached_property
     def mask(self) -> NDArray[np.bool_]:
         """Return which samples lie in a window, shape (n,)."""
         inside = np.zeros(self.recording.time.size, dtype=bool)

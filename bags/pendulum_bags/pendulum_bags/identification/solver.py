@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeAlias
@@ -10,22 +9,14 @@ from typing import TypeAlias
 import numpy as np
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.identification import arrowhead, kernel
-from pendulum_bags.identification.arrowhead import Blocks, minimise
+from pendulum_bags.identification import arrowhead
+from pendulum_bags.identification.arrowhead import minimise
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.identification.problem import Piece, longest_step, simulate
 
-__all__ = ["Solution", "angle_motions", "refine", "residuals", "robust_cost", "solve"]
+__all__ = ["Solution", "angle_motions", "refine", "residuals", "solve"]
 
 Solution: TypeAlias = arrowhead.Solution[FitModel]
-
-
-def robust_cost(residual: Array, scale: float) -> float:
-    """Return the soft-L1 cost, sum of 2 s^2 (sqrt(1 + (r/s)^2) - 1); s = inf gives the sum of squares [rad^2]."""
-    if not math.isfinite(scale):
-        return float(residual @ residual)
-    ratio = residual / scale
-    return float(2.0 * scale * scale * np.sum(np.sqrt(1.0 + ratio * ratio) - 1.0))
 
 
 def residuals(model: FitModel, pieces: Sequence[Piece], states: Sequence[Array] | None = None) -> list[Array]:
@@ -42,38 +33,14 @@ class _Motion:
     scale: float
     step: float
 
-    def cost(self, model: FitModel, states: Array) -> float:
-        mask = self.piece.mask
-        error = simulate(model, self.piece, states, step=self.step).theta[mask] - self.piece.recording.position[mask]
-        return robust_cost(error, self.scale) if np.isfinite(error).all() else np.inf
+    def errors(self, model: FitModel, states: Array) -> Array:
+        theta = simulate(model, self.piece, states, step=self.step).theta
+        return (theta - self.piece.recording.position)[self.piece.rows]
 
-    def linearise(self, model: FitModel, states: Array, names: Sequence[str]) -> tuple[float, Blocks]:
-        result = simulate(model, self.piece, states, free=model.index(names), step=self.step)
-        residual = result.theta - self.piece.recording.position
-        inside, blocks = residual[self.piece.mask], Blocks.zeros(len(names), len(states), 2)
-        if not (np.isfinite(inside).all() and np.isfinite(result.jacobian).all()):
-            return np.inf, blocks
-        weight = np.ones_like(residual)
-        if math.isfinite(self.scale):
-            weight = 1.0 / np.sqrt(1.0 + (residual / self.scale) ** 2)
-        kernel.normal_blocks(
-            result.jacobian,
-            residual,
-            weight,
-            self.piece.windows,
-            blocks.h_pp,
-            blocks.h_px,
-            blocks.h_xx,
-            blocks.g_p,
-            blocks.g_x,
-        )
-        return robust_cost(inside, self.scale), blocks
-
-    def sensitivities(self, model: FitModel, states: Array, names: Sequence[str]) -> tuple[list[Array], list[Array]]:
-        result = simulate(model, self.piece, states, free=model.index(names), step=self.step)
-        residual = result.theta - self.piece.recording.position
-        windows = self.piece.windows
-        return [result.jacobian[a:b] for a, b in windows], [residual[a:b] for a, b in windows]
+    def sensitivities(self, model: FitModel, states: Array, names: Sequence[str]) -> tuple[Array, Array, list[int]]:
+        result, piece = simulate(model, self.piece, states, free=model.index(names), step=self.step), self.piece
+        ends = [0, *np.cumsum(piece.windows[:, 1] - piece.windows[:, 0]).tolist()]
+        return result.jacobian[piece.rows], (result.theta - piece.recording.position)[piece.rows], ends
 
 
 def solve(
