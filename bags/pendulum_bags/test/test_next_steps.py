@@ -17,7 +17,7 @@ from pendulum_bags.commands.identify_cli import main
 from pendulum_bags.comparison import compare
 from pendulum_bags.identification.identify import identify
 from pendulum_bags.identification.options import Options
-from pendulum_bags.identification.residual_tests import _stretches, _told
+from pendulum_bags.identification.residual_tests import _outlier_sentence, _stretches
 from pendulum_bags.pages.terms import Terms
 from pendulum_bags.runs.datasets import Recording
 from pendulum_bags.runs.next_test import measurement_of, next_test_of, question_of, with_budget
@@ -302,10 +302,10 @@ def test_windows_that_stand_out_one_after_the_other_are_one_stretch_and_all_stre
     stretches = _stretches(outliers)
     assert [len(one) for one in stretches] == [1, 3, 1, 1]
     assert _stretches([]) == []
-    said = _told(stretches, 0.1)
+    said = _outlier_sentence(stretches, 0.1)
     assert said.startswith(
         "hw, 5.00 to 5.99 s after its start, 21.00 to 23.99 s after its start, 26.00 to 26.99 s after its start; "
         "other, 27.00 to 27.99 s after its start: the fit is 6 to 12 times worse there than in the median window"
     )
     assert "hand" not in said
-    assert "the fit is 6 times worse" in _told(stretches[:1], 0.1)
+    assert "the fit is 6 times worse" in _outlier_sentence(stretches[:1], 0.1)

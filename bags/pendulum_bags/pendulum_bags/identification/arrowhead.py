@@ -169,14 +169,14 @@ class Solution(Generic[M]):
         states: Initial states by recording, each shape (w, x).
         cost: Loss, sum over samples; inf where no motion stays within bounds.
         converged: Whether the search ended at a minimum, before its last iteration.
-        own: Values that each recording has of its own, shape (recordings, m).
+        offsets: Values that each recording has of its own, shape (recordings, m).
     """
 
     model: M
     states: list[Array]
     cost: float
     converged: bool
-    own: Array
+    offsets: Array
 
 
 def minimise(

@@ -78,7 +78,7 @@ def information(
     free: Sequence[str],
     own: Sequence[str] = (),
 ) -> Information:
-    """Return what the motions of recordings show of free parameters; each recording has its ``own`` ones beside."""
+    """Return what the motions of recordings show of free parameters; ``own`` ones are of each recording."""
     k, projected, residuals = len(free), list[list[Array]](), list[list[Array]]()
     for model, motion, x in zip(models, motions, states, strict=True):
         sensitivity, errors, ends = motion.sensitivities(model, x, (*free, *own))
@@ -183,9 +183,9 @@ def candidate_errors(candidate: Candidate, pieces: Sequence[Piece], scale: float
     found = errors_of(*names)
     linear, plain = found.covariance, found.white
     # A friction that ended at 0 is not known to be 0: what it could take over from the others widens those.
-    beside = tuple(n for n in ("damping", "coulomb_friction") if n in edges and model[n] <= 0.0)
-    if beside and names:
-        wide = errors_of(*names, *beside)
+    at_zero = tuple(n for n in ("damping", "coulomb_friction") if n in edges and model[n] <= 0.0)
+    if at_zero and names:
+        wide = errors_of(*names, *at_zero)
         linear, plain = (each[: len(names), : len(names)] for each in (wide.covariance, wide.white))
     before = np.sqrt(np.maximum(np.diag(linear), 1e-300))
     after = before

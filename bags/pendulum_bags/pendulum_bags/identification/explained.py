@@ -1,6 +1,6 @@
 """Does the model explain the motion at all?
 
-A fit always ends somewhere. Its error means something only beside what no model at all would leave: the error of the
+A fit always ends somewhere. Its error means something only next to what no model at all would leave: the error of the
 best straight line through each window, whose two numbers are those of the window's initial state.
 """
 
@@ -130,7 +130,7 @@ def undetermined_fit(fit: OutputErrorFit, uncertainty: Uncertainty) -> str | Non
     if not free and abs(level + model["torque_offset"]) < 0.1 * abs(level) > model["gravity"] and abs(level) > spread:
         lost["gravity"] = "torque_offset takes away the recorded torque, which may be what holds the weight"
     for name in at_bounds(fit.chosen):
-        # A strength of 0 is an answer; the end of a range that was never meant to be reached is none.
+        # A strength of 0 is a result; the end of a range that was never meant to be reached is none.
         if name in {"inertia", "gravity", "torque_offset", "angle_offset", "input_gain"} and model[name] != 0.0:
             lost[name] = "at the end of the range in which it is sought"
     if not lost:

@@ -1,4 +1,4 @@
-"""Does the fit agree with scales and rulers? A loud answer, because published identifications did not."""
+"""Does the fit agree with scales and rulers? A loud warning, because published identifications did not."""
 
 from __future__ import annotations
 

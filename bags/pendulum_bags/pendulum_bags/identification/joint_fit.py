@@ -1,10 +1,8 @@
-"""Output error for a mechanism: windows of free run, the state at the start of each fitted, by Levenberg-Marquardt.
-
-As for one joint (:mod:`~pendulum_bags.identification.solver`), parameters and start states make an arrowhead, and the
-states are eliminated window by window. Sensitivities are differences of compiled simulations.
+"""Output error of several joints: windows of free run, the state at the start of each fitted.
 
 A window's motion depends on its start and on the recorded efforts alone, not on what was measured inside it. So a
-controller that feeds noise back biases nothing, and an unstable plant only bounds the length of a window.
+controller that feeds noise back biases nothing, and an unstable plant only bounds the length of a window. Sensitivities
+are differences of compiled simulations.
 """
 
 from __future__ import annotations
@@ -19,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.identification.arrowhead import minimise
+from pendulum_bags.identification.arrowhead import Solution, minimise
 from pendulum_bags.identification.covariance import Information, information
 from pendulum_bags.identification.joint_kernel import lagged, motion_kernel
 from pendulum_bags.identification.joint_model import DELAY, LAG, JointModel
@@ -220,30 +218,20 @@ def noise_of(position: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class JointFit:
-    """A fit.
+class JointFit(Solution[JointModel]):
+    """A fit of several joints.
 
     Attributes:
-        model: Parameters at the minimum.
         free: Names of what was fitted.
-        states: Start states by recording, shape (w, 2 n).
-        cost: Weighted sum of squares, with that of what was known beforehand.
-        converged: Whether the search ended at a minimum, before its most steps.
         data: The windows of each recording.
         weights: Of the errors of positions and velocities, shape (2 n,).
-        own: Names of what each recording has a value of its own of; the model has their mean.
-        offsets: Those values, shape (recordings, m).
+        own: Names of what each recording has a value of its own of.
     """
 
-    model: JointModel
     free: tuple[str, ...]
-    states: list[Array]
-    cost: float
-    converged: bool
     data: Sequence[Windows]
     weights: Array
     own: tuple[str, ...]
-    offsets: Array
 
     def again(self, weights: Array, **changes: Any) -> JointFit:
         """Return the fit from here under other weights, and with other arguments of :func:`fit`."""
@@ -386,8 +374,8 @@ def fit(
     )
     if not math.isfinite(found.cost):
         raise DataError(_AWAY)
-    rest = found.states, found.cost, found.converged, data, weights, tuple(own), found.own
-    return JointFit(found.model, tuple(free), *rest)
+    rest = found.states, found.cost, found.converged, found.offsets
+    return JointFit(found.model, *rest, tuple(free), data, weights, tuple(own))
 
 
 def scores(

@@ -41,7 +41,7 @@ _SHORTEST, _SHORTEST_BY_VELOCITY = 0.2, 0.1
 """Shortest window by default, however fast neighbouring motions part, and where velocities were measured [s]."""
 
 _FAST = 0.005
-"""Longest sampling period from which a lag of the actuators can be told from a delay [s]."""
+"""Longest sampling period from which a lag of the actuators differs visibly from a delay [s]."""
 
 _POOR = 0.25
 """Share of what straight lines miss from which on a fit is tried again by way of shorter windows."""
@@ -65,7 +65,7 @@ EXTRAS: Mapping[str, Mapping[str, bool]] = {
     "friction, offsets, delay": {"offsets": True, "delay": True},
     "friction, offsets, delay, lag": {"offsets": True, "delay": True, "lag": True},
 }
-"""Candidates: what is fitted beside masses and friction."""
+"""Candidates: what is fitted in addition to masses and friction."""
 
 ALL_EXTRAS = "friction, offsets, delay, lag"
 """The last of them, which is fitted where it is named: most recordings tell no lag from a delay."""

@@ -42,7 +42,7 @@ def hold_undetermined(found: JointFit) -> tuple[JointFit, list[str]]:
         except DataError:
             break
         if trial.cost > 1.1 * found.cost:
-            # The start's value is no answer: the recordings refuse it, though they know no better.
+            # The start's value is no result: the recordings refuse it, though they know no better.
             break
         found = trial
         held.append(worst)

@@ -33,69 +33,44 @@ INDEX: Mapping[str, int] = {name: i for i, name in enumerate(PARAMETER_NAMES)}
 
 FURTHER_TERMS = tuple(name for name in FRICTION_TERMS if name != "load")
 """Friction terms of plants that the kernel does not know by itself; they are fitted when asked for by name."""
-_FURTHER = {name: told for term in FURTHER_TERMS for name, told in FRICTION_TERMS[term].parameters.items()}
+_FURTHER = {name: default for term in FURTHER_TERMS for name, default in FRICTION_TERMS[term].parameters.items()}
 
-UNITS: Mapping[str, str] = {
-    "inertia": "kg m^2",
-    "damping": "N m s/rad",
-    "gravity": "N m",
-    "coulomb_friction": "N m",
-    "stribeck_excess": "N m",
-    "stribeck_velocity": "rad/s",
-    "load_friction": "-",
-    "torque_offset": "N m",
-    "angle_offset": "rad",
-    "input_gain": "N m per unit of input",
-    "transport_delay": "s",
-    "drive_damping": "N m s/rad",
-    "drive_load_friction": "-",
-    "load_stribeck": "-",
-    **{name: quantity.unit for name, (_, quantity) in _FURTHER.items()},
+_QUANTITIES: Mapping[str, tuple[str, float, float, float]] = {
+    "inertia": ("kg m^2", 1e-7, 1e3, 1.0),
+    "damping": ("N m s/rad", 0.0, 1e4, 0.0),
+    "gravity": ("N m", 0.0, 1e4, 1.0),
+    "coulomb_friction": ("N m", 0.0, 1e3, 0.0),
+    "stribeck_excess": ("N m", 0.0, 1e3, 0.0),
+    "stribeck_velocity": ("rad/s", 0.02, 2.0, 0.2),
+    "load_friction": ("-", 0.0, 0.9, 0.0),
+    "torque_offset": ("N m", -1e3, 1e3, 0.0),
+    "angle_offset": ("rad", -0.5, 0.5, 0.0),
+    "input_gain": ("N m per unit of input", -1e4, 1e4, 1.0),
+    "transport_delay": ("s", -0.03, 0.1, 0.0),
+    "drive_damping": ("N m s/rad", 0.0, 1e3, 0.0),
+    "drive_load_friction": ("-", 0.0, 0.9, 0.0),
+    "load_stribeck": ("-", 0.0, 10.0, 0.0),
+    # A strength may be 0; what gives a term its form stays within a thousandth and a thousandfold of its default.
+    **{name: (quantity.unit, 1e-3 * value, 1e3 * value or 1e3, value) for name, (value, quantity) in _FURTHER.items()},
 }
+"""Unit, bounds and default of each parameter; a delay below 0 means an input stamped late."""
 
+UNITS: Mapping[str, str] = {name: unit for name, (unit, *_) in _QUANTITIES.items()}
+BOUNDS: Mapping[str, tuple[float, float]] = {name: (low, high) for name, (_, low, high, _) in _QUANTITIES.items()}
 _PER_INERTIA = {"kg m^2": "1", "N m": "1/s^2", "N m s/rad": "1/s", "N m per unit of input": "1/s^2 per unit of input"}
 
-BOUNDS: Mapping[str, tuple[float, float]] = {
-    "inertia": (1e-7, 1e3),
-    "damping": (0.0, 1e4),
-    "gravity": (0.0, 1e4),
-    "coulomb_friction": (0.0, 1e3),
-    "stribeck_excess": (0.0, 1e3),
-    "stribeck_velocity": (0.02, 2.0),
-    "load_friction": (0.0, 0.9),
-    "torque_offset": (-1e3, 1e3),
-    "angle_offset": (-0.5, 0.5),
-    "input_gain": (-1e4, 1e4),
-    "transport_delay": (-0.03, 0.1),
-    "drive_damping": (0.0, 1e3),
-    "drive_load_friction": (0.0, 0.9),
-    "load_stribeck": (0.0, 10.0),
-    # A strength may be 0; what gives a term its form stays within a thousandth and a thousandfold of its default.
-    **{name: (1e-3 * default, 1e3 * default or 1e3) for name, (default, _) in _FURTHER.items()},
-}
-"""Domain in which each parameter is sought; a delay below 0 means an input stamped late."""
+_STRIBECK = ("coulomb_friction", "stribeck_excess", "stribeck_velocity")
+_GEAR = ("load_friction", "drive_load_friction")
 
 FRICTION_MODELS: Mapping[str, tuple[str, ...]] = {
     "viscous": (),
     "coulomb": ("coulomb_friction",),
-    "stribeck": ("coulomb_friction", "stribeck_excess", "stribeck_velocity"),
+    "stribeck": _STRIBECK,
     "load": ("coulomb_friction", "load_friction"),
-    "stribeck_load": ("coulomb_friction", "stribeck_excess", "stribeck_velocity", "load_friction"),
-    "gear_load": ("coulomb_friction", "load_friction", "drive_load_friction"),
-    "stribeck_gear_load": (
-        "coulomb_friction",
-        "stribeck_excess",
-        "stribeck_velocity",
-        "load_friction",
-        "drive_load_friction",
-    ),
-    "gear_load_stribeck": (
-        "coulomb_friction",
-        "stribeck_velocity",
-        "load_friction",
-        "drive_load_friction",
-        "load_stribeck",
-    ),
+    "stribeck_load": (*_STRIBECK, "load_friction"),
+    "gear_load": ("coulomb_friction", *_GEAR),
+    "stribeck_gear_load": (*_STRIBECK, *_GEAR),
+    "gear_load_stribeck": ("coulomb_friction", "stribeck_velocity", *_GEAR, "load_stribeck"),
     **{name: ("coulomb_friction", *FRICTION_TERMS[name].parameters) for name in FURTHER_TERMS},
 }
 """Dry friction that each model adds to the viscous one, simplest first."""
@@ -106,9 +81,13 @@ SERVO_ONLY = ("stribeck_gear_load", "gear_load_stribeck")
 PLANT_FRICTION_MODELS = ("viscous", "coulomb", "stribeck", "load", "stribeck_load", *FURTHER_TERMS)
 """Those that a plant file can hold: its friction knows the load of gravity, not that of the drive."""
 
-_DEFAULTS: dict[str, float] = {"inertia": 1.0, "gravity": 1.0, "input_gain": 1.0, "stribeck_velocity": 0.2}
+_DEFAULTS = {name: default for name, (*_, default) in _QUANTITIES.items()}
 _SIZES = {"transport_delay": 1e-2, "angle_offset": 1e-1, "stribeck_velocity": 1e-1}
-_DEFAULTS |= {name: default for name, (default, _) in _FURTHER.items()}
+_SHARED = (
+    *("inertia", "damping", "gravity", "coulomb_friction", "stribeck_velocity", "load_friction", "torque_offset"),
+    *("angle_offset", *_FURTHER),
+)
+"""Parameters that the plant has by the same name."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +112,7 @@ class FitModel(Model):
         values = {**_DEFAULTS, **self.values}
         for name in values.keys() - INDEX.keys():
             raise DataError(f"fit model has no parameter {name!r}; expected one of {', '.join(PARAMETER_NAMES)}")
-        vector = np.array([values.get(name, 0.0) for name in PARAMETER_NAMES], dtype=float)
+        vector = np.array([values[name] for name in PARAMETER_NAMES], dtype=float)
         if not np.isfinite(vector).all() or vector[INDEX["inertia"]] <= 0.0:
             raise DataError(f"fit model has the values {dict(self.values)}; expected finite numbers and inertia > 0")
         vector.setflags(write=False)
@@ -193,17 +172,9 @@ def from_plant(plant: PlantParameters) -> FitModel:
         )
     return FitModel(
         {
-            "inertia": plant.inertia,
-            "damping": plant.damping,
-            "gravity": plant.gravity,
-            "coulomb_friction": plant.coulomb_friction,
+            **{name: getattr(plant, name) for name in _SHARED},
             "stribeck_excess": plant.static_friction - plant.coulomb_friction,
-            "stribeck_velocity": plant.stribeck_velocity,
-            "load_friction": plant.load_friction,
-            "torque_offset": plant.torque_offset,
-            "angle_offset": plant.angle_offset,
             "transport_delay": plant.transport_delay + plant.actuator_time_constant,
-            **{name: getattr(plant, name) for name in _FURTHER},
         },
         friction="stribeck_load",
     )
@@ -216,19 +187,12 @@ def to_plant(model: FitModel, *, name: str = "identified", effort_limit: float =
     that with the drive switched on (back-EMF included). A delay below 0 is a matter of the recording's
     stamps, not of the plant, and is left out.
     """
-    further: dict[str, Any] = {name: model[name] for name in _FURTHER}
+    values: dict[str, Any] = {name: model[name] for name in _SHARED}
+    values["damping"] += model["drive_damping"] if model.input_kind == "position_goal" else 0.0
     return pendulum_plant(
-        inertia=model["inertia"],
-        damping=model["damping"] + (model["drive_damping"] if model.input_kind == "position_goal" else 0.0),
-        gravity=model["gravity"],
-        coulomb_friction=model["coulomb_friction"],
+        **values,
         static_friction=model["coulomb_friction"] + model["stribeck_excess"],
-        stribeck_velocity=model["stribeck_velocity"],
-        load_friction=model["load_friction"],
-        torque_offset=model["torque_offset"],
-        angle_offset=model["angle_offset"],
         effort_limit=effort_limit,
         transport_delay=max(model["transport_delay"], 0.0),
         name=name,
-        **further,
     )

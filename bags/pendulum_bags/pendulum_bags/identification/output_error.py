@@ -55,7 +55,7 @@ class OutputErrorFit:
         sign_flipped: Whether the recorded effort counts with sign -1.
         offset_candidates: Fits with Coulomb friction, one for each set of offsets that was tried.
         reading: How the angle seems to be measured, if not in rad from hanging.
-        zeros: Offsets of the recordings beside their mean, where they differ; ``pieces`` are without them.
+        zeros: Offsets of the recordings from their mean, where they differ; ``pieces`` are without them.
         recordings: As they were read.
     """
 
@@ -247,7 +247,7 @@ def _offsets(
         values = {k: v for k, v in best.model.values.items() if k not in offsets or k in kept}
         start = replace(best, model=replace(best.model, values=values, friction="coulomb"))
         candidates.append(_fit_friction("coulomb", start, pieces, names, scale, (), options))
-    # An offset that is kept by luck biases all others: the stricter penalty (Schwarz) keeps few of those.
+    # An offset that is chosen by luck biases all others: the stricter penalty (Schwarz) keeps few of those.
     chosen = choose(candidates, strict=True)
     return tuple(n for n in chosen.free if n in free), chosen.solution, tuple(candidates)
 
@@ -304,7 +304,7 @@ def _fit_friction(
 
 
 def _inside(solution: Solution, pieces: Sequence[Piece]) -> Array:
-    """Return the residuals of all windows, by the steps of an answer, shape (n,) [rad]."""
+    """Return the residuals of all windows, by the steps of a final fit, shape (n,) [rad]."""
     parts = residuals(solution.model, pieces, solution.states)
     return np.concatenate([part[piece.mask] for part, piece in zip(parts, pieces, strict=True)])
 
@@ -314,7 +314,7 @@ def _is_friction(name: str) -> bool:
 
 
 def _finish(candidate: Candidate, pieces: Sequence[Piece], scale: float) -> Candidate:
-    """Return the candidate fitted to the end with fine integration steps, single windows tried anew."""
+    """Return the candidate fitted to the end with fine integration steps, single windows tried again."""
     found = candidate.solution
     final = solve(found.model, pieces, candidate.free, states=found.states, scale=scale, tolerance=1e-8)
     final = refine(final, pieces, candidate.free, scale=scale)

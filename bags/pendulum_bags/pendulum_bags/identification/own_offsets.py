@@ -19,7 +19,7 @@ __all__ = ["OwnOffsets", "align", "pay"]
 
 @dataclass(frozen=True)
 class OwnOffsets:
-    """Offsets of the recordings beside their mean.
+    """Offsets of the recordings from their mean.
 
     Args:
         names: Of the offsets, m of them.
@@ -38,7 +38,7 @@ class OwnOffsets:
         ]
         return (
             "Each recording has a zero of its own (homing, or the tare of the torque): "
-            f"{'; '.join(listings)} beside the common one, which is their mean."
+            f"{'; '.join(listings)} from the common one, which is their mean."
         )
 
 
@@ -72,7 +72,7 @@ def align(
     count = effective_samples(by_window(residuals(found.model, pieces, found.states), pieces))
     if not pay(found.cost, best.cost, count, len(pieces) - 1):
         return found, list(pieces), None
-    zeros = OwnOffsets((name,), best.own - best.own.mean(axis=0))
+    zeros = OwnOffsets((name,), best.offsets - best.offsets.mean(axis=0))
     shifts = zeros.values[:, 0].tolist()
     moved = [
         prepare(_moved(piece.recording, name, value, best.model), window)

@@ -37,7 +37,7 @@ def write_page(result: IdentificationResult, folder: str | Path) -> Path:
     return write_sheet(
         target / "index.html",
         "Identification",
-        _told([result.verdict, *result.sentences()]),
+        _marked([result.verdict, *result.sentences()]),
         [*result.tables(), Table("Correlation", "", ("", *names), correlation)],
         figures,
         kicker=f"{result.choice}, {result.created}",
@@ -57,7 +57,7 @@ def write_thesis_page(result: ThesisResult, recordings: Sequence[Recording], fol
     return write_sheet(
         target / "index.html",
         f"Regression: {result.kind.replace('_', ' and ')}",
-        _told(result.sentences),
+        _marked(result.sentences),
         [Table("Average over trials", "", ("coefficient", "value", "95 % interval", "unit"), rows)],
         figures,
         listings=[(one.trial, one.summary) for one in result.trials],
@@ -65,7 +65,7 @@ def write_thesis_page(result: ThesisResult, recordings: Sequence[Recording], fol
     )
 
 
-def _told(sentences: Sequence[str]) -> list[Sentence]:
+def _marked(sentences: Sequence[str]) -> list[Sentence]:
     return [Sentence(sentence, alarming=sentence.startswith(ALARMS)) for sentence in sentences]
 
 

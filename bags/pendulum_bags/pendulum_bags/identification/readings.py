@@ -119,6 +119,22 @@ def _quick(
     return _share(found, few), found
 
 
+def _confirmed(
+    recordings: Sequence[Recording],
+    fixed: FitModel,
+    free: Sequence[str],
+    window: float | None,
+    share: float,
+    start: Solution | None = None,
+) -> tuple[float, Solution] | None:
+    """Return what share a fit to all windows misses, and the fit, where that is little and far less than before."""
+    start = start or _quick(recordings, fixed, free, window)[1]
+    if start is None:
+        return None
+    other, found = _quick(recordings, fixed, free, window, whole=start)
+    return None if found is None or other > min(DOUBTFUL_SHARE, _BETTER * share) else (other, found)
+
+
 _Cause = tuple[float, str, str]
 
 
@@ -145,9 +161,10 @@ def _other_reading(
             if found is not None and other < _BETTER * min(share, 1.0):
                 tried.append((other, words, advice, factor, shift, recordings, found))
     for _, words, advice, factor, shift, recordings, start in sorted(tried, key=lambda one: one[0])[:3]:
-        other, found = _quick(recordings, fixed, free, window, whole=start)
-        if found is None or other > min(DOUBTFUL_SHARE, _BETTER * share):
+        confirmed = _confirmed(recordings, fixed, free, window, share, start)
+        if confirmed is None:
             continue
+        other, found = confirmed
         if "gravity" in free and found.model["gravity"] <= 0.02 * found.model["inertia"]:
             continue
         zero = math.remainder(shift - found.model["angle_offset"], math.tau)
@@ -174,7 +191,7 @@ def _zero_words(shift: float, zero: float, factor: float) -> tuple[str, str]:
     elif abs(abs(zero) - 0.5 * math.pi) < 0.2:
         name, exact = "measured from the horizontal", math.copysign(0.5 * math.pi, zero)
     else:
-        name, exact = f"measured from {abs(zero):.2f} rad beside hanging", zero
+        name, exact = f"measured from {abs(zero):.2f} rad off hanging", zero
     return name, f"`offset: {exact / factor:.6g}`"
 
 
@@ -196,18 +213,15 @@ def _other_stamps(
     low, high = BOUNDS["transport_delay"]
     if low < -best < high:
         return None
-    recordings = [_shifted(piece.recording, best) for piece in pieces]
-    _, start = _quick(recordings, fixed, free, window)
-    if start is None:
+    confirmed = _confirmed([_shifted(piece.recording, best) for piece in pieces], fixed, free, window, share)
+    if confirmed is None:
         return None
-    other, found = _quick(recordings, fixed, free, window, whole=start)
-    if found is None or other > min(DOUBTFUL_SHARE, _BETTER * share):
-        return None
+    other, found = confirmed
     off = best - found.model["transport_delay"]
     where = "before" if off < 0.0 else "after"
     return (
         other,
-        f"the stamps of the torque seem to be off: the motion answers it {abs(off):.3g} s {where} them",
+        f"the stamps of the torque seem to be off: the motion follows it {abs(off):.3g} s {where} them",
         "Record torque and angle by one clock, or correct the stamps of one of them by this time.",
     )
 
@@ -226,12 +240,10 @@ def _other_window(
     usual = default_window(fixed.input_kind, sum(recording.duration for recording in recordings))
     if usual is None or (window is not None and 0.5 * usual < window < 2.0 * usual):
         return None
-    _, start = _quick(recordings, fixed, free, usual)
-    if start is None:
+    confirmed = _confirmed(recordings, fixed, free, usual, share)
+    if confirmed is None:
         return None
-    other, found = _quick(recordings, fixed, free, usual, whole=start)
-    if found is None or other > min(DOUBTFUL_SHARE, _BETTER * share):
-        return None
+    other = confirmed[0]
     given = "whole recordings" if window is None else f"windows of {window:g} s"
     return other, f"{given} do not show this motion to a fit", f"Leave out --window: {usual:g} s serve."
 

@@ -117,7 +117,7 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
     if left_out is not None:
         said.insert(0, left_out)
     if outliers:
-        said.append(_told(_stretches(outliers), middle))
+        said.append(_outlier_sentence(_stretches(outliers), middle))
     bound = 2.576 / float(np.sqrt(samples))
     return ResidualTests(
         auto,
@@ -148,7 +148,7 @@ def _stretches(outliers: Sequence[Outlier]) -> list[list[Outlier]]:
     return stretches
 
 
-def _told(stretches: Sequence[Sequence[Outlier]], middle: float) -> str:
+def _outlier_sentence(stretches: Sequence[Sequence[Outlier]], middle: float) -> str:
     places: dict[str, list[str]] = {}
     for stretch in stretches:
         places.setdefault(stretch[0][0], []).append(f"{stretch[0][1]:.2f} to {stretch[-1][2]:.2f} s after its start")

@@ -48,7 +48,7 @@ __all__ = [
 FORMAT = "pendulum_identification/1"
 
 ALARMS = (CONTRADICTION, REFUSED, INCOMPLETE)
-"""How sentences begin that nobody should overlook."""
+"""How alarming sentences begin."""
 
 
 @dataclass(frozen=True)
@@ -146,12 +146,12 @@ class IdentificationResult:
         command = command or f"python -m pendulum_bags replay RECORDING --params {shlex.quote(plant)}"
         incomplete = "The model is incomplete. " if self.incomplete else ""
         apart = "Apart from the windows named above, it" if self._apart else "It"
-        told = (
+        sentence = (
             f"{incomplete}{apart} misses {100.0 * self.explained.share:.2g} % of what straight lines through the "
             "windows miss; whether that is good enough to design a controller on, no fit can say. Test it "
             f"{unseen} that it was not fitted to.{question_of(command)}"
         )
-        return f"{told.removesuffix('.')}:", command
+        return f"{sentence.removesuffix('.')}:", command
 
     def _records(self) -> list[Mapping[str, Any]]:
         assert isinstance(self.fit, JointFit)
@@ -159,7 +159,7 @@ class IdentificationResult:
 
     def tables(self) -> list[Table]:
         """Return parameters, candidates and recordings, for terminal and page."""
-        predicted = self._predicted()
+        predicted = self.predicted
         head = ("parameter", "value", "95 % interval", *(["predicted"] if predicted else []), "unit")
         rows = []
         for name in dict.fromkeys((*self.fit.free, *(n for n in self.intervals if n == FREQUENCY))):
@@ -189,7 +189,9 @@ class IdentificationResult:
             Table(f"Free run over {window}", "", ("recording", *joints, "of straight lines"), scores),
         ]
 
-    def _predicted(self) -> dict[str, float]:
+    @property
+    def predicted(self) -> dict[str, float]:
+        """Half widths of the intervals that the design of the excitation predicted; empty for other recordings."""
         return {}
 
     def to_dict(self) -> dict[str, Any]:
@@ -345,7 +347,7 @@ class PendulumResult(IdentificationResult):
 
     @property
     def predicted(self) -> dict[str, float]:
-        """Half widths of the intervals that the design of the excitation predicted; empty for other recordings."""
+        """Those widths, where there is one recording."""
         if len(self.fit.pieces) != 1:
             return {}
         design = self.fit.pieces[0].recording.meta.get("pendulum.excitation")
@@ -368,9 +370,6 @@ class PendulumResult(IdentificationResult):
         listing = ", ".join(f"{name} {ratio:.2g}" for name, ratio in ratios.items())
         text = f"Half widths obtained over those that the design of the excitation predicted: {listing}; they are 1 "
         return [text + "where the prior plant and the sensor noise were true and the model misses nothing."]
-
-    def _predicted(self) -> dict[str, float]:
-        return self.predicted
 
     def _records(self) -> list[Mapping[str, Any]]:
         records = [run_record(piece.recording.meta) for piece in self.fit.pieces]
@@ -487,7 +486,7 @@ _LARGEST_VALUE = 1e300
 
 
 def load_fit_model(path: str | Path) -> FitModel:
-    """Return the fit model from the JSON that :meth:`IdentificationResult.write` left beside the plant file."""
+    """Return the fit model from the JSON that :meth:`IdentificationResult.write` wrote next to the plant file."""
     source = Path(path)
     try:
         content = json.loads(source.read_text(encoding="utf-8"))

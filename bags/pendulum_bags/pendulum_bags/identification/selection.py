@@ -152,7 +152,7 @@ def is_plausible(candidate: Candidate) -> bool:
 def implausible_rival(candidates: Sequence[Candidate], chosen: Candidate) -> Candidate | None:
     """Return the candidate left out for its static friction that the data clearly speak for, or None.
 
-    What was chosen in its place has to stand in for it, and no interval of that counts the error.
+    The chosen one compensates for it, and no interval of that counts the error.
     """
     rivals = [candidate for candidate in candidates if not is_plausible(candidate)]
     if not rivals or not is_plausible(chosen):

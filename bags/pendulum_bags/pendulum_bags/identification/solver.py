@@ -83,9 +83,9 @@ def refine(solution: Solution, pieces: Sequence[Piece], free: Sequence[str], *, 
             better = current.copy()
             for i in range(len(piece.windows)):
                 single = [piece.subset([i])]
-                kept = solve(solution.model, single, (), states=[current[[i]]], scale=scale, max_iterations=5)
+                unchanged = solve(solution.model, single, (), states=[current[[i]]], scale=scale, max_iterations=5)
                 speed = max(abs(current[i, 1]), 0.02)
-                lowest = kept.cost
+                lowest = unchanged.cost
                 for velocity in (0.0, -speed, speed, float(piece.states[i, 1])):
                     start = np.array([[current[i, 0], velocity]])
                     trial = solve(solution.model, single, (), states=[start], scale=scale, max_iterations=15)

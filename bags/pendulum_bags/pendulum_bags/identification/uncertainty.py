@@ -27,7 +27,7 @@ _LEAST_INDEPENDENT = 5.0
 """Independent pieces that the residuals count as at least, in a profile."""
 
 RIVAL = 0.02
-"""Share of the kept offset's Akaike weight from which on the other one counts as its equal (a difference of 8)."""
+"""Share of the fitted offset's Akaike weight from which on the other one counts as its equal (a difference of 8)."""
 
 
 @dataclass(frozen=True)
@@ -143,10 +143,10 @@ def _widen_by_joint_offsets(
 ) -> None:
     """Widen the interval of a single offset to what a fit of both leaves open: near one angle they act alike."""
     joint = next((c for c in fit.offset_candidates if set(OFFSETS) <= set(c.free)), None)
-    kept = [name for name in OFFSETS if name in fit.chosen.free]
-    if joint is None or len(kept) != 1 or kept[0] not in intervals:
+    fitted = [name for name in OFFSETS if name in fit.chosen.free]
+    if joint is None or len(fitted) != 1 or fitted[0] not in intervals:
         return
-    name, errors = kept[0], candidate_errors(joint, fit.pieces, fit.scale, white=white)
+    name, errors = fitted[0], candidate_errors(joint, fit.pieces, fit.scale, white=white)
     if name in errors.deviation:
         alone, both = (intervals[name], _interval(name, joint.solution.model, errors.deviation[name], 0.0, quantile))
         wide = max(alone.standard_error, both.standard_error)
@@ -167,8 +167,8 @@ def _with_model_choice(fit: OutputErrorFit, own: Errors, *, white: bool) -> dict
             apart = _value(candidate.as_searched.model, name) - _value(base, name)
             averaged[name] = total + weight * float(np.hypot(errors.deviation.get(name, 0.0), apart))
     dry = _with_dry_friction(fit, own, white=white)
-    kept = set(OFFSETS) & set(fit.chosen.free)
-    same = next((c.solution.model for c in fit.offset_candidates if set(OFFSETS) & set(c.free) == kept), None)
+    fitted = set(OFFSETS) & set(fit.chosen.free)
+    same = next((c.solution.model for c in fit.offset_candidates if set(OFFSETS) & set(c.free) == fitted), None)
     result = {}
     for name, deviation in own.deviation.items():
         squares = 0.0
@@ -210,17 +210,17 @@ def _value(model: FitModel, name: str) -> float:
 
 
 def unresolved_offset(fit: OutputErrorFit) -> str | None:
-    """Return the offset that was left out although it would have done nearly as well as the one that was kept."""
-    kept = [name for name in OFFSETS if name in fit.chosen.free]
-    if len(kept) != 1:
+    """Return the offset that was left out although it would have done nearly as well as the fitted one."""
+    fitted = [name for name in OFFSETS if name in fit.chosen.free]
+    if len(fitted) != 1:
         return None
     weights = akaike_weights(fit.offset_candidates) if fit.offset_candidates else {}
-    other = next(name for name in OFFSETS if name not in kept)
+    other = next(name for name in OFFSETS if name not in fitted)
     share = {
         name: sum(weights[id(c)] for c in fit.offset_candidates if set(OFFSETS) & set(c.free) == {name})
         for name in OFFSETS
     }
-    return other if share[other] > RIVAL * share[kept[0]] else None
+    return other if share[other] > RIVAL * share[fitted[0]] else None
 
 
 def _positive(name: str) -> bool:
