@@ -10,7 +10,7 @@ import pytest
 
 from pendulum_bags.commands import excite_cli
 from pendulum_bags.identification.excitation import Excitation, Limits, design_excitation
-from pendulum_bags.identification.identify_mechanism import identify_mechanism
+from pendulum_bags.identification.identify import identify_joints
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
@@ -57,7 +57,7 @@ def test_a_fit_has_the_intervals_that_were_predicted(design: Excitation) -> None
     noisy = position + np.random.default_rng(1).normal(0.0, NOISE, position.shape)
     effort = np.stack([design.effort, np.zeros_like(design.effort)], axis=1)
     recording = JointRecording("played", design.time, noisy, effort, ("zero", "zero"))
-    result = identify_mechanism(plant, [recording], extras="friction")
+    result = identify_joints(plant, [recording], extras="friction")
     assert not result.refused, result.refusal
     for name in ("cart_mass", "pole_centre", "pole_inertia", "cart.damping", "pole.damping"):
         interval = result.intervals[name]

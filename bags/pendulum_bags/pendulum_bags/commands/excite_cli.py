@@ -76,7 +76,7 @@ def excite(
     Example: python -m pendulum_bags excite --plant dfki --max-effort 1.5 --max-angle 2 --out excitation.csv --play
     """
     from pendulum_bags.identification.excitation import KINDS, Limits, design_excitation
-    from pendulum_bags.identification.mechanism_model import MechanismModel
+    from pendulum_bags.identification.joint_model import JointModel
     from pendulum_bags.identification.model import UNITS
     from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 
@@ -127,7 +127,7 @@ def excite(
         title = f"{design.kind}, {duration:g} s: predicted 95 % intervals, if the prior plant is true"
         table = WholeTable("parameter", "half width", "relative", "unit", title=title)
         for name, width in design.predicted.items():
-            of = UNITS[name] if prior.is_pendulum else MechanismModel.of(prior).unit(name)
+            of = UNITS[name] if prior.is_pendulum else JointModel.of(prior).unit(name)
             table.add_row(name, f"{width:.3g}", f"{100.0 * design.relative[name]:.2g} %", of)
         console.print(table)
         reached = ", ".join(

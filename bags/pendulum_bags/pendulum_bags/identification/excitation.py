@@ -17,10 +17,10 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.covariance import without
+from pendulum_bags.identification.joint_fit import Windows, prepare_windows
+from pendulum_bags.identification.joint_kernel import motion_kernel
+from pendulum_bags.identification.joint_model import DELAY, LAG, JointModel
 from pendulum_bags.identification.joint_recordings import JointRecording
-from pendulum_bags.identification.mechanism_fit import Windows, prepare_windows
-from pendulum_bags.identification.mechanism_kernel import motion_kernel
-from pendulum_bags.identification.mechanism_model import DELAY, LAG, MechanismModel
 from pendulum_bags.identification.model import BOUNDS, INDEX, from_plant
 from pendulum_bags.identification.problem import prepare, simulate
 from pendulum_bags.runs.datasets import Recording
@@ -152,7 +152,7 @@ def design_excitation(
     if plant.is_pendulum:
         known, usual = [name for name in BOUNDS if name != "input_gain"], _OF_ONE
     else:
-        known = [*MechanismModel.of(plant).fitted()]
+        known = [*JointModel.of(plant).fitted()]
         usual = tuple(name for name in known if not name.endswith(_FRICTION) or plant.value(name) > 0.0)
     parameters = tuple(parameters) or usual
     for name in parameters:
@@ -262,9 +262,9 @@ def _windowed(problem: _Problem, effort: Array, theta: Array, omega: Array, free
     return np.concatenate([without(part[:, -2:], part[:, :-2]) for part in parts])
 
 
-def _joint_model(plant: PlantParameters) -> MechanismModel:
+def _joint_model(plant: PlantParameters) -> JointModel:
     lags = [actuator.time_constant for actuator in plant.actuators]
-    return MechanismModel.of(plant).with_changes({DELAY: common_delay(plant), LAG: lags[0]})
+    return JointModel.of(plant).with_changes({DELAY: common_delay(plant), LAG: lags[0]})
 
 
 def _joint_windows(problem: _Problem, effort: Array, position: Array, window: float) -> Windows:
@@ -289,7 +289,7 @@ def _joint_motion(problem: _Problem, effort: Array) -> tuple[Array, Array]:
     return path[first:, :n], path[first:, n:]
 
 
-def _joint_path(model: MechanismModel, data: Windows, states: Array, values: Array | None = None) -> Array:
+def _joint_path(model: JointModel, data: Windows, states: Array, values: Array | None = None) -> Array:
     """Return motions (c, w, l, 2 n) of values (c, parameters), by default the model's, from states (c, w, 2 n)."""
     values = model.vector[None] if values is None else values
     drive = data.input(model[DELAY], model[LAG])[None]
@@ -341,7 +341,7 @@ def _judge(problem: _Problem, kind: str, shape: Array) -> Excitation:
         names = [*problem.parameters, *others, *(n for n in NUISANCE if n not in problem.parameters)]
         jacobian = _windowed(problem, effort, theta, omega, [INDEX[name] for name in names])
     else:
-        model = MechanismModel.of(plant)
+        model = JointModel.of(plant)
         offsets = [name for group in model.own_offsets for name in group]
         names = [*dict.fromkeys((*problem.parameters, *model.fitted(), *offsets))]
         jacobian = _joint_windowed(problem, effort, theta, omega, names)
@@ -355,7 +355,7 @@ def _judge(problem: _Problem, kind: str, shape: Array) -> Excitation:
         # A parameter that is 0 in the prior has no relative error: take its share of gravity instead.
         size = {n: abs(own[n]) or 0.05 * max(plant.gravity, 1e-3) for n in problem.parameters}
     else:
-        size = {n: MechanismModel.of(plant).size(n) for n in problem.parameters}
+        size = {n: JointModel.of(plant).size(n) for n in problem.parameters}
     relative = {name: predicted[name] / size[name] for name in problem.parameters}
     score = float(np.mean([np.log(max(value, 1e-12)) for value in relative.values()]))
     return Excitation(kind, problem.time, effort, theta, omega, predicted, relative, score)
