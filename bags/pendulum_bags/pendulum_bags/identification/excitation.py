@@ -17,8 +17,7 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.covariance import without
-from pendulum_bags.identification.joint_fit import Windows, prepare_windows
-from pendulum_bags.identification.joint_kernel import motion_kernel
+from pendulum_bags.identification.joint_fit import Windows, motions, prepare_windows, sensitivity
 from pendulum_bags.identification.joint_model import DELAY, LAG, JointModel
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.model import BOUNDS, INDEX, from_plant
@@ -37,8 +36,6 @@ _LEAD = 100
 """Samples at rest before the excitation of several joints."""
 _COASTING = 0.6
 """Time for which a slide must stay within its travel after the excitation [s]."""
-_STEP = 1e-4
-"""Step of differences, in the size of a parameter, and in rad, m, rad/s or m/s of a start."""
 NUISANCE = ("angle_offset", "transport_delay")
 """Parameters that a fit will also have to find."""
 
@@ -284,20 +281,10 @@ def _joint_motion(problem: _Problem, effort: Array) -> tuple[Array, Array]:
     padded = np.concatenate([np.zeros(_LEAD), effort])
     data = _joint_windows(whole, padded, np.zeros((whole.time.size, n)), float(whole.time[-1]) + 1.0)
     at = np.zeros((1, 1, 2 * n))
-    path = _joint_path(_joint_model(problem.plant), data, at)[0, 0][data.inside[0]]
+    model = _joint_model(problem.plant)
+    path = motions(model, model.vector[None], data, at)[0, 0][data.inside[0]]
     first = path.shape[0] - time.size
     return path[first:, :n], path[first:, n:]
-
-
-def _joint_path(model: JointModel, data: Windows, states: Array, values: Array | None = None) -> Array:
-    """Return motions (c, w, l, 2 n) of values (c, parameters), by default the model's, from states (c, w, 2 n)."""
-    values = model.vector[None] if values is None else values
-    drive = data.input(model[DELAY], model[LAG])[None]
-    path = np.empty((len(values), *data.time.shape, states.shape[-1]))
-    run, steps = motion_kernel(model.plant.mechanism.name), np.diff(data.time, axis=1)
-    which = np.zeros(len(values), dtype=np.int64)
-    run(*model.tables(values), drive, which, steps, np.ascontiguousarray(states), path)
-    return path
 
 
 def _joint_windowed(problem: _Problem, effort: Array, position: Array, velocity: Array, names: Sequence[str]) -> Array:
@@ -307,18 +294,10 @@ def _joint_windowed(problem: _Problem, effort: Array, position: Array, velocity:
     data = _joint_windows(problem, effort, position, float(np.clip(problem.time[-1] / 6.0, 0.5, 5.0)))
     first = np.searchsorted(problem.time, data.time[:, 0] - 1e-9)
     states = np.concatenate([position[first], velocity[first]], axis=1)
-    index = model.index(names)
-    steps = np.array([*(_STEP * model.size(name) for name in names), *[_STEP] * (2 * n)])
-    values, starts = np.tile(model.vector, (steps.size, 1)), np.tile(states, (steps.size, 1, 1))
-    for c, step in enumerate(steps):
-        if c < len(index):
-            values[c, index[c]] += step
-        else:
-            starts[c, :, c - len(index)] += step
-    moved = _joint_path(model, data, starts, values) - _joint_path(model, data, states[None])
-    slopes = np.moveaxis(moved[..., :n] / steps[:, None, None, None], 0, -1)
-    parts = [rows[inside].reshape(-1, steps.size) for rows, inside in zip(slopes, data.inside, strict=True)]
-    return np.concatenate([without(part[:, len(index) :], part[:, : len(index)]) for part in parts])
+    path = motions(model, model.vector[None], data, states[None])[0]
+    slopes, k = sensitivity(model, names, data, states, path)[:, :, :n], len(names)
+    parts = [rows[inside].reshape(-1, k + 2 * n) for rows, inside in zip(slopes, data.inside, strict=True)]
+    return np.concatenate([without(part[:, k:], part[:, :k]) for part in parts])
 
 
 def _keeps(problem: _Problem, shape: Array) -> bool:

@@ -36,10 +36,12 @@ __all__ = [
     "first_weights",
     "fit",
     "line_errors",
+    "motions",
     "noise_of",
     "prepare_windows",
     "rms_by_joint",
     "scores",
+    "sensitivity",
     "window_length",
 ]
 
@@ -250,13 +252,13 @@ class JointFit(Solution[JointModel]):
         0 in the padding and where no velocity was measured.
         """
         rows = zip(self.models, self.data, self.states, strict=True)
-        return [_errors(part, _motions(one, one.vector[None], part, x[None])[0]) for one, part, x in rows]
+        return [_errors(part, motions(one, one.vector[None], part, x[None])[0]) for one, part, x in rows]
 
     @cached_property
     def information(self) -> Information:
         """Sensitivities and errors by window, weighted."""
-        motions = [_Motion(part, self.weights) for part in self.data]
-        return information(self.models, motions, self.states, self.free, self.own)
+        weighted = [_Motion(part, self.weights) for part in self.data]
+        return information(self.models, weighted, self.states, self.free, self.own)
 
     @property
     def residuals(self) -> list[Array]:
@@ -275,7 +277,7 @@ class JointFit(Solution[JointModel]):
         return max(score.share for score in self.scores)
 
 
-def _motions(model: JointModel, values: Array, data: Windows, states: Array) -> Array:
+def motions(model: JointModel, values: Array, data: Windows, states: Array) -> Array:
     """Return motions, shape (c, w, l, 2 n), of values (c, parameters) and start states (c, w, 2 n)."""
     pairs, which = np.unique(values[:, model.index((DELAY, LAG))], axis=0, return_inverse=True)
     drive = np.array([data.input(*pair) for pair in pairs])
@@ -286,7 +288,7 @@ def _motions(model: JointModel, values: Array, data: Windows, states: Array) -> 
     return path
 
 
-def _sensitivity(model: JointModel, names: Sequence[str], data: Windows, states: Array, path: Array) -> Array:
+def sensitivity(model: JointModel, names: Sequence[str], data: Windows, states: Array, path: Array) -> Array:
     """Return those of a motion to parameters and start states, shape (w, l, 2 n, k + 2 n)."""
     index, width = model.index(names), states.shape[1]
     steps = np.array([*(_DIFFERENCE * model.size(name) for name in names), *[_DIFFERENCE] * width])
@@ -297,7 +299,7 @@ def _sensitivity(model: JointModel, names: Sequence[str], data: Windows, states:
             values[c, index[c]] += step
         else:
             starts[c, :, c - len(index)] += step
-    found = (_motions(model, values, data, starts) - path) / steps[:, None, None, None]
+    found = (motions(model, values, data, starts) - path) / steps[:, None, None, None]
     return np.moveaxis(found, 0, -1)
 
 
@@ -320,7 +322,7 @@ class _Motion:
     def _path(self, model: JointModel, states: Array) -> Array:
         last = self.last
         if last is None or not (np.array_equal(last[0], model.vector) and np.array_equal(last[1], states)):
-            path = _motions(model, model.vector[None], self.part, states[None])[0]
+            path = motions(model, model.vector[None], self.part, states[None])[0]
             self.last = last = (model.vector, states, path)
         return last[2]
 
@@ -330,7 +332,7 @@ class _Motion:
     def sensitivities(self, model: JointModel, states: Array, names: Sequence[str]) -> tuple[Array, Array, list[int]]:
         path, part = self._path(model, states), self.part
         own = self.weights * np.repeat([1.0, float(part.velocity is not None)], part.position.shape[-1])
-        scaled = _sensitivity(model, names, part, states, path) * (part.inside[..., None] * own)[..., None]
+        scaled = sensitivity(model, names, part, states, path) * (part.inside[..., None] * own)[..., None]
         errors = np.ravel(_errors(part, path) * self.weights)
         return scaled.reshape(-1, scaled.shape[-1]), errors, list(range(0, errors.size + 1, errors.size // len(path)))
 
@@ -414,7 +416,7 @@ def window_length(model: JointModel, recordings: Sequence[JointRecording], longe
         data = Windows(recording, steps, steps > 0.0, np.stack((q[:-1], q[1:]), axis=1), None, states, _area(recording))
         starts = np.tile(states, (2 * n + 1, 1, 1))
         starts[np.arange(1, 2 * n + 1), :, np.arange(2 * n)] += _DIFFERENCE
-        path = _motions(model, np.tile(smooth, (2 * n + 1, 1)), data, starts)[:, :, 1]
+        path = motions(model, np.tile(smooth, (2 * n + 1, 1)), data, starts)[:, :, 1]
         gain = np.moveaxis((path[1:] - path[0]) / _DIFFERENCE, 0, -1)
         most = _APART if recording.velocity is None else _APART_BY_VELOCITY
         for first in range(0, len(gain), max(1, len(gain) // 12)):

@@ -58,7 +58,6 @@ class JointRecording:
     renamed: str = ""
 
     def __post_init__(self) -> None:
-        """Check that the arrays fit together."""
         size = self.time.size
         if self.position.shape != self.effort.shape or self.position.shape[0] != size:
             raise DataError(

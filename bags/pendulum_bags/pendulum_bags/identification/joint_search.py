@@ -105,7 +105,6 @@ def _choose(
 
 
 def _with_own_offsets(start: JointModel, found: JointFit, weights: Array) -> JointFit:
-    """Return the fit in which each of several recordings has offsets of its own, where the data ask for it."""
     groups = found.model.own_offsets if len(found.data) > 1 else ()
     if not groups:
         return found

@@ -108,7 +108,6 @@ class FitModel(Model):
     vector: Array = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Build the vector; unknown names are an error."""
         values = {**_DEFAULTS, **self.values}
         for name in values.keys() - INDEX.keys():
             raise DataError(f"fit model has no parameter {name!r}; expected one of {', '.join(PARAMETER_NAMES)}")

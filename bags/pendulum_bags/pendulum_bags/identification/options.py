@@ -30,7 +30,6 @@ class Geometry:
     inertia: float | None = None
 
     def __post_init__(self) -> None:
-        """Check that what is given is positive."""
         for name, unit in (("mass", "kg"), ("length", "m"), ("inertia", "kg m^2")):
             value = getattr(self, name)
             if value is not None and not (np.isfinite(value) and value > 0.0):
@@ -74,7 +73,6 @@ class Options:
     robust: bool = True
 
     def __post_init__(self) -> None:
-        """Check names and the window."""
         if self.window is not None and not (np.isfinite(self.window) and self.window > 0.0):
             raise DataError(f"window is {self.window} s; expected > 0")
         if self.friction != "auto" and self.friction not in FRICTION_MODELS:

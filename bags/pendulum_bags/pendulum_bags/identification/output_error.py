@@ -268,7 +268,6 @@ def _fit_friction(
     simpler: Sequence[Candidate],
     options: Options,
 ) -> Candidate:
-    """Fit one friction model from the best simpler fits, and cross-validate it."""
     names = FRICTION_MODELS[name]
     everything = (*free, *names)
     begin: list[tuple[FitModel, list[Array]]] = []
@@ -304,7 +303,6 @@ def _fit_friction(
 
 
 def _inside(solution: Solution, pieces: Sequence[Piece]) -> Array:
-    """Return the residuals of all windows, by the steps of a final fit, shape (n,) [rad]."""
     parts = residuals(solution.model, pieces, solution.states)
     return np.concatenate([part[piece.mask] for part, piece in zip(parts, pieces, strict=True)])
 

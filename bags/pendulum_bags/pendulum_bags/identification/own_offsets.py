@@ -86,7 +86,6 @@ def align(
 
 
 def _moved(recording: Recording, name: str, value: float, model: FitModel) -> Recording:
-    """Return the recording as it would be had its zero been the common one."""
     if name == "torque_offset":
         gain = model["input_gain"] or 1.0
         return replace(recording, input=recording.input + value / gain)

@@ -161,7 +161,6 @@ def _candidate_figure(result: PendulumResult) -> Canvas:
 
 
 def _save(figures: Mapping[str, Canvas], folder: Path) -> list[Path]:
-    """Write figures as PNG files and return their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     paths = []
     for name, figure in figures.items():

@@ -85,7 +85,6 @@ def misfit_cause(
 
 
 def _share(found: Solution, pieces: Sequence[Piece]) -> float:
-    """Return the error of a fit over that of straight lines."""
     errors, lines = errors_by_window(residuals(found.model, pieces, found.states), pieces)
     if not np.all(np.isfinite(errors)):
         return math.inf
@@ -227,7 +226,6 @@ def _other_stamps(
 
 
 def _shifted(recording: Recording, shift: float) -> Recording:
-    """Return the recording with its input that much earlier [s], where that is known."""
     stamps = recording.input_stamps - shift
     return replace(recording, input_time=stamps).between(float(stamps[0]), float(stamps[-1]) + 1e-9)
 
@@ -264,7 +262,6 @@ def _is_static(found: Solution, pieces: Sequence[Piece]) -> bool:
 
 
 def _torque_of_angle(model: FitModel, pieces: Sequence[Piece]) -> bool:
-    """Return whether the recorded torque is a function of the angle, to 1 %."""
     if model.input_kind not in {"effort", "voltage"}:
         return False
     u = np.concatenate([_drive(model, piece) for piece in pieces])

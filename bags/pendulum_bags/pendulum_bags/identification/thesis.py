@@ -245,7 +245,6 @@ def fit_inertia_damping(recordings: Sequence[Recording], *, skew: float | None =
 
 
 def _skew(recording: Recording) -> float:
-    """Return how far apart velocity and effort of one sample may have been taken [s]."""
     same_record = recording.input_time is None and "topic" in recording.meta
     return RECORD_SKEW if same_record else 0.5 * recording.period
 
