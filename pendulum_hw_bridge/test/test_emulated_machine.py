@@ -259,6 +259,32 @@ def test_a_limit_lowers_what_a_drive_makes_and_cannot_raise_it() -> None:
         assert machine.drives[0].limit == kept
 
 
+@pytest.mark.parametrize("band", [0.0, 4.0])
+def test_a_limit_of_a_motor_in_volts_holds_with_a_dead_band_too(band: float) -> None:
+    machine = EmulatedMachine(load_mechanism("qube_servo").with_values({"arm.dead_band": band}))
+    arm = machine_ports(machine, SteppedClock())[0]
+    assert isinstance(arm, DrivePort)
+    for volts, kept in ((5.0, 5.0), (100.0, 10.0)):
+        arm.set_limits(replace(arm.connect().limits, effort=0.005 * volts))
+        assert machine.drives[0].limit * machine.constants[0].supply_voltage == pytest.approx(kept)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 14.0])
+def test_a_record_has_angle_and_speed_of_the_motor_before_its_own_gears(ratio: float) -> None:
+    plant = load_mechanism("qube_servo").with_values({"arm.gear_ratio": ratio})
+    machine = EmulatedMachine(plant, INSTANT)
+    machine.switch(0, 0, on=True)
+    machine.set_lifetime(0, 5.0)
+    machine.deliver(0, 0.1, 0)
+    machine.advance_to(100 * MILLISECOND)
+    record = machine.feedback(0, 100 * MILLISECOND)
+    assert record is not None
+    position, velocity = (values[0] for values in machine.state[:2])
+    assert record.motor_velocity == pytest.approx(ratio * velocity, rel=0.05)
+    assert record.motor_position == pytest.approx(ratio * position, rel=0.05)
+    assert velocity > 0.5
+
+
 def test_a_delay_of_the_plant_file_is_inside_the_drive_and_a_stop_does_not_wait_for_it() -> None:
     plant = load_mechanism("acrobot").with_values({"elbow.transport_delay": 0.02})
     machine = EmulatedMachine(plant, INSTANT)

@@ -103,6 +103,7 @@ class DrivePort(JointPort):
         )
         self._gains = DEFAULT_GAINS[TORQUE_LOOP]
         self._volts = machine.coordinates.volts
+        self._supply = machine.constants[self._motor].supply_voltage if self._volts else 1.0
         self._loop = Strategy.DIRECT_PWM if self._volts else TORQUE_LOOP
         self._strategy = Strategy.OFF
 
@@ -156,10 +157,9 @@ class DrivePort(JointPort):
         """Set the limits; the effort limit cannot exceed the drive's own."""
         self._require_reach("limits")
         self._limits = limits
-        largest, full = self.machine.largest[self._motor], self.machine.plant.effort_limits[self._motor]
-        self.machine.drives[self._motor].limit = (
-            largest * min(1.0, limits.effort / full) if self._volts else min(limits.effort, full)
-        )
+        # A duty counts from zero, not from the dead band.
+        wanted = limits.effort / (self.machine.plant.gains[self._motor] * self._supply)
+        self.machine.drives[self._motor].limit = min(self.machine.largest[self._motor], wanted)
         return self._limits
 
     def set_command_lifetime(self, lifetime: float) -> float:

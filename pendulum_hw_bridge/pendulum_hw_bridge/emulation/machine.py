@@ -318,8 +318,7 @@ class EmulatedMachine:
                 self._outboxes[index].append(distort(record, faults, None))
 
     def _measure(self, index: int, of_velocity: float, of_effort: float) -> Feedback:
-        own, joint = self.hardware, self.coordinates.joints[index]
-        step = self._steps[index]
+        own, step = self.hardware, self._steps[index]
         position = step * round(self._position[index] / step)
         velocity = self._velocity[index] + self._noise[index] * of_velocity
         record = Feedback(
@@ -367,8 +366,8 @@ class EmulatedMachine:
             pwm_command=duty,
             motor_current=duty * current if drive.on else 0.0,
             winding_current=current,
-            motor_position=position * own.gear_ratio / own.scale(joint),
-            motor_velocity=velocity * own.gear_ratio / own.scale(joint),
+            motor_position=position * constants.gear_ratio,
+            motor_velocity=velocity * constants.gear_ratio,
             winding_temperature=drive.temperature,
             lock=CommandLock.UNLOCKED if drive.expires_ns is None else CommandLock.LOCKED_BY_SENDER,
         )
