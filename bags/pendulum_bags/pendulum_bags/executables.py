@@ -9,6 +9,7 @@ EXECUTABLES: dict[str, str] = {
     "compare": "pendulum_bags.commands.compare_cli:main",
     "frequency_response": "pendulum_bags.commands.frequency_response_cli:main",
     "ranking": "pendulum_bags.commands.ranking_cli:main",
+    "study": "pendulum_bags.commands.public_study_cli:main",
     "replay": "pendulum_bags.commands.replay_cli:main",
     "experiment": "pendulum_bags.commands.experiment_cli:main",
     "move": "pendulum_bags.commands.move_cli:main",

@@ -20,6 +20,7 @@ from pendulum_bags.studies.mechanism_benchmark import (
     PUBLISHED,
     benchmark_plant,
     criteria_of,
+    score_v1,
     score_v2,
     time_above_line,
 )
@@ -82,13 +83,16 @@ def test_criteria_and_scores_are_those_of_the_public_implementation() -> None:
     assert criteria == pytest.approx(
         {
             "swingup_time": 0.834,
+            "max_torque": 2.0,
             "energy": 0.9611022146845036,
+            "torque_integral": 1.2832219609830104,
             "torque_cost": 1.0424642028009294,
             "torque_smoothness": 0.0032622124584485,
             "velocity_cost": 22.01641374319899,
         },
         rel=1e-12,
     )
+    assert score_v1(criteria, T[-1]) == pytest.approx(0.9421396348377297, rel=1e-12)
     assert score_v2(criteria, T[-1]) == pytest.approx(0.8767631498765713, rel=1e-12)
     assert time_above_line(plant, T, states) == pytest.approx(9.506, rel=1e-12)
     # One that falls and comes back counts from when it is back.

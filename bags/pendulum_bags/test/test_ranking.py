@@ -467,3 +467,21 @@ def test_two_policies_of_one_file_name_are_two_and_named_by_their_files(tmp_path
     names = {one.name for one in collect_contenders([tmp_path])[0]}
     assert len(names) == 3
     assert all(name.startswith("policy trained (file=") and str(tmp_path) not in name for name in names)
+
+
+def test_the_lost_score_of_a_pick_that_scores_nothing_has_an_interval():
+    """The best scores 0.4 in the mean: neither is all of it surely lost, nor is the rest of its score known better."""
+    best = [0.45, 0.3, 0.5, 0.35]
+    rows = {"pick": [0.0, 0.0, 0.0, 0.0], "best": best, "other": [0.2, 0.1, 0.1, 0.2]}
+    seeds = {"pick": (1, 2, 3, 4), "best": (5, 6, 7, 8), "other": (9, 10, 11, 12)}
+    both = [
+        Contender(name, np.array([[-float(name == "pick")]]), -np.array(row)[:, None], 0, 0, (0,), seeds[name])
+        for name, row in rows.items()
+    ]
+    found = rank(both, of_scores=True)
+    error = np.std(best, ddof=1) / 2.0
+    # Student's t of three degrees of freedom at 1.25 % (two rivals) and at 2.5 %.
+    assert (found.pick, found.regret.value) == ("pick", pytest.approx(0.4))
+    assert (found.regret.low, found.regret.high) == pytest.approx(
+        (0.4 - 4.1765 * error, 0.4 + 3.1824 * error), rel=1e-3
+    )

@@ -23,6 +23,7 @@ SECTIONS: dict[str, dict[str, str]] = {
         "compare": "pendulum_bags compare",
         "frequency_response": "pendulum_bags frequency_response",
         "ranking": "pendulum_bags ranking",
+        "study": "pendulum_bags study",
         "report": "pendulum_bags report",
         "analyse": "pendulum_bags analyse",
     },

@@ -115,17 +115,24 @@ class Ranking:
     unknown_seeds: bool = False
 
     @property
+    def chance(self) -> float:
+        """Share of all orders whose rank correlation is as large or larger; NaN of many contenders."""
+        n = len(self.names)
+        if n >= _MANY or not math.isfinite(self.spearman):
+            return math.nan
+        ranks = np.arange(n)
+        apart = np.sum((np.array(list(permutations(ranks))) - ranks) ** 2, axis=1)
+        return float(np.mean(1.0 - 6.0 * apart / (n * (n * n - 1.0)) >= self.spearman - 1e-9))
+
+    @property
     def few(self) -> str:
         """What so few contenders show by chance, as a sentence; empty of many."""
         n = len(self.names)
-        if n >= _MANY or not math.isfinite(self.spearman):
+        if not math.isfinite(self.chance):
             return ""
-        ranks = np.arange(n)
-        apart = np.sum((np.array(list(permutations(ranks))) - ranks) ** 2, axis=1)
-        chance = float(np.mean(1.0 - 6.0 * apart / (n * (n * n - 1.0)) >= self.spearman - 1e-9))
         return (
             f"{n} controllers are few: by chance the best of them is picked in 1 of {n} cases, and a rank "
-            f"correlation of {self.spearman:.2f} or more arises in {100.0 * chance:.0f} %."
+            f"correlation of {self.spearman:.2f} or more arises in {100.0 * self.chance:.0f} %."
         )
 
     def to_json(self) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import Interval, student_quantile
 from pendulum_bags.ranking.contender import Contender, compared_runs, error_of_difference
 
@@ -67,17 +68,33 @@ def _lost_share(chosen: Contender, others: Sequence[Contender], *, favoured: boo
     value = max(0.0, 1.0 - own / best) if best > 0.0 else 0.0
     if len(chosen.hw) < 2 and all(len(one.hw) < 2 for one in others):
         return Interval(value, math.nan, math.nan), _ran_once(chosen, others)
-    if own <= 0.0:
-        return Interval(1.0, 1.0, 1.0), ""
     rivals = [one for one in others if one.cost("hw") < 0.0]
-    limits = np.array([_limits(one, chosen, len(rivals), of_scores=True, favoured=favoured) for one in rivals])
     if not rivals:
         return Interval(0.0, 0.0, 0.0), ""
+    limits = np.array([_lost_limits(chosen, one, len(rivals), favoured=favoured) for one in rivals])
     if np.isnan(limits).any():
         return Interval(value, math.nan, math.nan), _ran_once(chosen, others)
-    # By the logarithm of the rival's score per the pick's.
-    low, high = np.maximum(-np.expm1(-limits.max(axis=0)), 0.0)
+    low, high = np.maximum(limits.max(axis=0) / best, 0.0)
     return Interval(value, float(min(low, value)), float(max(high, value))), ""
+
+
+def _lost_limits(chosen: Contender, rival: Contender, comparisons: int, *, favoured: bool) -> tuple[float, float]:
+    """Return the limits of a rival's mean score less the pick's, as :func:`_limits`: some scores are 0."""
+    own, other, paired = compared_runs(chosen, rival)
+    if own.size == other.size == 1:
+        return math.nan, math.nan
+    error, freedom = _error(own, other, paired=paired)
+    tails = _TAIL / comparisons, 1.0 - (_FAVOURED if favoured else _TAIL)
+    low, high = (float(own.mean() - other.mean() + error * student_quantile(tail, freedom)) for tail in tails)
+    return low, high
+
+
+def _error(own: Array, other: Array, *, paired: bool) -> tuple[float, float]:
+    """Return :func:`error_of_difference`; one that ran once is taken to scatter like the other."""
+    if min(own.size, other.size) > 1:
+        return error_of_difference(own, other, paired=paired)
+    repeated = max(own, other, key=len)
+    return float(np.std(repeated, ddof=1)) * math.sqrt(1.0 + 1.0 / repeated.size), repeated.size - 1.0
 
 
 def _ran_once(chosen: Contender, others: Sequence[Contender]) -> str:
@@ -89,31 +106,19 @@ def _ran_once(chosen: Contender, others: Sequence[Contender]) -> str:
     return f"{chosen.name}, the pick, {ran} on the hardware, and so did {named}"
 
 
-def _limits(
-    chosen: Contender, another: Contender, comparisons: int, *, of_scores: bool = False, favoured: bool = False
-) -> tuple[float, float]:
+def _limits(chosen: Contender, another: Contender, comparisons: int, *, favoured: bool = False) -> tuple[float, float]:
     """Return the limits of the logarithm of two mean costs' ratio, the lower corrected for comparisons; NaN of one run.
 
     The logarithm of the ratio of means is taken as linear in the deviations of the runs from them: runs scatter by
     shares.
     """
     own, other, paired = compared_runs(chosen, another)
-    if of_scores:
-        own, other = -own, -other
     if paired and not (own.mean() > 0.0 and other.mean() > 0.0):
-        sign = -1.0 if of_scores else 1.0
-        own, other, paired = sign * chosen.hw.sum(axis=1), sign * another.hw.sum(axis=1), False
-    ratio = float(np.log(own.mean() / other.mean()))
-    own, other = own / own.mean(), other / other.mean()
-    repeated = [one for one in (own, other) if one.size > 1]
-    if not repeated:
+        own, other, paired = chosen.hw.sum(axis=1), another.hw.sum(axis=1), False
+    if own.size == other.size == 1:
         return math.nan, math.nan
-    if len(repeated) == 1:
-        # The one that ran once is taken to scatter like the other.
-        deviation = float(np.std(repeated[0], ddof=1)) * math.sqrt(1.0 + 1.0 / repeated[0].size)
-        freedom = repeated[0].size - 1.0
-    else:
-        deviation, freedom = error_of_difference(own, other, paired=paired)
+    ratio = float(np.log(own.mean() / other.mean()))
+    deviation, freedom = _error(own / own.mean(), other / other.mean(), paired=paired)
     tails = _TAIL / comparisons, _FAVOURED if favoured else _TAIL
     low, high = (-float(student_quantile(tail, freedom)) for tail in tails)
     return ratio - low * deviation, ratio + high * deviation

@@ -1,10 +1,11 @@
 """The public double-pendulum benchmark: its criteria, its scores, its published rows.
 
+    score v1 = success (1 - sum over the criteria of weight criterion / norm)
     score v2 = success (1 - mean over the criteria of tanh(pi criterion / norm))
     score v3 = seconds above the line / 60
 
-Up is a tip above nine tenths of the arms' length. Definitions, norms and rows follow the public implementation, also
-where it differs from the paper: it computed the rows.
+Up is a tip above nine tenths of the arms' length, success to be up at the end. Definitions, norms and rows follow the
+public implementation, also where it differs from the paper: it computed the rows.
 
 Sources: F. Wiebe et al., Open-source dual-purpose acrobot and pendubot platform, IEEE RAM 31(2), 2024; F. Wiebe et al.,
 Reinforcement learning for athletic intelligence, IJCAI 2024; github.com/dfki-ric-underactuated-lab/double_pendulum.
@@ -13,7 +14,7 @@ Reinforcement learning for athletic intelligence, IJCAI 2024; github.com/dfki-ri
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -28,6 +29,8 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mecha
 __all__ = [
     "BENCHMARK_PLANTS",
     "CRITERIA",
+    "CRITERIA_HARDWARE",
+    "CRITERIA_V1",
     "PUBLISHED",
     "Criterion",
     "Published",
@@ -35,6 +38,7 @@ __all__ = [
     "criteria_of",
     "is_above_line",
     "line_height",
+    "score_v1",
     "score_v2",
     "time_above_line",
 ]
@@ -51,6 +55,7 @@ class Criterion(NamedTuple):
     title: str
     unit: str
     norm: float
+    weight: float = 1.0
 
 
 CRITERIA = (
@@ -60,7 +65,21 @@ CRITERIA = (
     Criterion("torque_smoothness", "smoothness", "N m", 0.1),
     Criterion("velocity_cost", "velocity cost", "rad²/s", 400.0),
 )
-"""The criteria of score v2, all of the same weight."""
+"""The criteria of score v2 in simulation, all of the same weight."""
+CRITERIA_HARDWARE = tuple(
+    one._replace(norm={"torque_cost": 100.0, "torque_smoothness": 4.0}.get(one.name, one.norm)) for one in CRITERIA
+)
+"""Those of score v2 on hardware."""
+CRITERIA_V1 = (
+    Criterion("swingup_time", "time", "s", 10.0, 0.2),
+    Criterion("max_torque", "largest torque", "N m", 6.0, 0.1),
+    Criterion("energy", "energy", "J", 100.0, 0.1),
+    Criterion("torque_integral", "torque integral", "N m s", 60.0, 0.1),
+    Criterion("torque_cost", "torque cost", "N² m² s", 360.0, 0.1),
+    Criterion("torque_smoothness", "smoothness", "N m", 12.0, 0.2),
+    Criterion("velocity_cost", "velocity cost", "rad²/s", 1000.0, 0.2),
+)
+"""Those of score v1, in simulation and on hardware."""
 
 
 @dataclass(frozen=True)
@@ -138,19 +157,27 @@ def criteria_of(plant: PlantParameters, times: Array, states: Array, efforts: Ar
     dt = np.diff(times)
     return {
         "swingup_time": float(times[entered]),
+        "max_torque": float(np.max(np.abs(efforts))),
         "energy": float(np.sum(np.abs(np.diff(states[:, :2], axis=0) * efforts[:-1]))),
+        "torque_integral": float(np.sum(np.abs(efforts[:-1]) * dt[:, None])),
         "torque_cost": float(np.sum(efforts[:-1] ** 2 * dt[:, None])),
         "torque_smoothness": float(np.sum(np.std(np.diff(efforts, axis=0), axis=0))),
         "velocity_cost": float(np.sum(states[:-1, 2:] ** 2 * dt[:, None])),
     }
 
 
-def score_v2(criteria: Mapping[str, float], duration: float) -> float:
-    """Return the score of a swing-up of ``duration`` [s], 0 where the tip was not up at the end."""
+def score_v1(criteria: Mapping[str, float], duration: float) -> float:
+    """Return score v1 of a swing-up of ``duration`` [s], 0 where the tip was not up at the end."""
     if not criteria["swingup_time"] < duration:
         return 0.0
-    share = sum(math.tanh(math.pi * criteria[one.name] / one.norm) for one in CRITERIA)
-    return 1.0 - share / len(CRITERIA)
+    return 1.0 - sum(one.weight * criteria[one.name] / one.norm for one in CRITERIA_V1)
+
+
+def score_v2(criteria: Mapping[str, float], duration: float, norms: Sequence[Criterion] = CRITERIA) -> float:
+    """Return score v2 of a swing-up of ``duration`` [s], 0 where the tip was not up at the end."""
+    if not criteria["swingup_time"] < duration:
+        return 0.0
+    return 1.0 - sum(math.tanh(math.pi * criteria[one.name] / one.norm) for one in norms) / len(norms)
 
 
 def time_above_line(plant: PlantParameters, times: Array, states: Array) -> float:

@@ -1,0 +1,214 @@
+"""Public contests on a real acrobot and pendubot: would their simulation have picked the best controller?
+
+Each trial on the machines is scored from its trajectory and compared with its published score; then each contest's
+simulation ranks the controllers that ran on both sides.
+
+Source: github.com/dfki-ric-underactuated-lab/real_ai_gym_leaderboard (81ea5bc), read from a clone; rules: its folder
+leaderboards and github.com/dfki-ric-underactuated-lab/double_pendulum (1e8544e), folder leaderboard.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pendulum_bags.ranking.contender import Contender
+from pendulum_bags.ranking.ranking import Ranking, rank
+from pendulum_bags.recordings.delimited import read_delimited
+from pendulum_bags.studies.mechanism_benchmark import (
+    BENCHMARK_PLANTS,
+    CRITERIA,
+    CRITERIA_HARDWARE,
+    benchmark_plant,
+    criteria_of,
+    score_v1,
+    score_v2,
+    time_above_line,
+)
+from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.parameters import load_yaml
+
+__all__ = [
+    "CONTESTS",
+    "SIMULATED",
+    "TOLERANCE",
+    "Comparison",
+    "Contest",
+    "Trial",
+    "comparisons",
+    "read_trials",
+    "score_of",
+]
+
+TOLERANCE = 0.005
+"""Largest difference of a score from the published one that counts as equal."""
+SIMULATED = {
+    "score": "scores*.csv",
+    "score by the machine's norms": "sim_swingup.csv",
+    "robustness": "scores.yml",
+}
+"""What a simulation picks by, and the files that give it. Score v2 has other norms in simulation than on machines."""
+_SCORE, _NORMS, _ROBUSTNESS = SIMULATED
+_LEAST = 3
+_WHOLE = 0.99
+"""Share of its planned length from which a run may be a success."""
+_ALIASES = {"MC-PILCO": "mcpilco", "ilqr_tvlqr": "ilqr_tvlqr_lqr"}
+"""Folders of controllers that have another name elsewhere."""
+_COLUMNS = ("time", "pos_meas1", "pos_meas2", "vel_meas1", "vel_meas2", "tau_con1", "tau_con2")
+
+
+class Contest(NamedTuple):
+    """A contest: folder of its trials below ``data/ROBOT``, version of its score, folder of its simulation or empty.
+
+    ``duration`` is the planned length of a trial [s]; ``paired`` says that trial i of each controller had the same
+    perturbations.
+    """
+
+    name: str
+    folder: str
+    version: str
+    simulation: str = ""
+    duration: float = 10.0
+    paired: bool = False
+
+
+CONTESTS = (
+    Contest("first board", "real_system", "v1", "simulation"),
+    Contest("first board by v2", "real_system", "v2", "simulation_v2"),
+    Contest("first board, perturbed", "real_system_perturbed", "v2"),
+    Contest("IROS 2024", "real_system_iros2024", "v2", "simulation_v2", paired=True),
+    Contest("ICRA 2025", "real_system_icra2025", "v3", "simulation_icra2025", 60.0),
+)
+_PERTURBED = [one._replace(norm=1.0) if one.name == "torque_smoothness" else one for one in CRITERIA]
+"""The perturbed acrobot's board was made with norms of its own."""
+
+
+class Trial(NamedTuple):
+    """A trial on a machine: its published score, that of its trajectory or None, and a tested cause of a difference."""
+
+    contest: Contest
+    robot: str
+    controller: str
+    number: int
+    published: float
+    computed: float | None
+    reason: str = ""
+
+    @property
+    def score(self) -> float:
+        """The computed score, or else the published one."""
+        return self.published if self.computed is None else self.computed
+
+
+class Comparison(NamedTuple):
+    """A contest's ranking by a criterion of its simulation, judged by the trials on the machine.
+
+    There is none of fewer than three controllers; ``trials`` counts those on the machine by controller.
+    """
+
+    contest: Contest
+    robot: str
+    criterion: str
+    ranking: Ranking | None
+    trials: dict[str, int]
+
+
+def score_of(contest: Contest, robot: str, trajectory: Path) -> tuple[float, float]:
+    """Return a trajectory's score by the contest's rules on the machine, and the same of a run of any length.
+
+    Raises:
+        DataError: The file lacks one of the columns of time, measured states and commanded torques.
+    """
+    table = read_delimited(trajectory)
+    if missing := [name for name in _COLUMNS if name not in table.columns]:
+        raise DataError(
+            f"{trajectory} lacks the columns {', '.join(missing)}; expected a trajectory of the leaderboard"
+        )
+    rows = np.stack([table.values(name) for name in _COLUMNS], axis=1)
+    times, states, efforts, plant = rows[:, 0], rows[:, 1:5], rows[:, 5:], benchmark_plant(robot)
+    if contest.version == "v3":
+        return (time_above_line(plant, times, states) / contest.duration,) * 2
+    criteria, end = criteria_of(plant, times, states, efforts), float(times[-1])
+    norms = _PERTURBED if (contest.folder, robot) == ("real_system_perturbed", "acrobot") else CRITERIA_HARDWARE
+    score = score_v1(criteria, end) if contest.version == "v1" else score_v2(criteria, end, norms)
+    return score if end >= _WHOLE * contest.duration else 0.0, score
+
+
+def read_trials(data: Path) -> list[Trial]:
+    """Return every trial of all contests in a clone, scored where it has the trajectory.
+
+    Raises:
+        DataError: There are no trials, or a file is damaged.
+    """
+    trials = []
+    for contest in CONTESTS:
+        name = "scores.csv" if contest.version == "v1" else f"scores_{contest.version}.csv"
+        for robot in BENCHMARK_PLANTS:
+            for file in sorted((data / "data" / robot / contest.folder).glob(f"*/experiment*/{name}")):
+                published, trajectory = _published(file), file.with_name("trajectory.csv")
+                of_rules, of_any = score_of(contest, robot, trajectory) if trajectory.is_file() else (None, published)
+                short = of_rules is not None and abs(of_rules - of_any) > TOLERANCE >= abs(of_any - published)
+                reason = f"up at its end before {contest.duration:g} s: published as a success, none by the rules"
+                number = int(file.parent.name.removeprefix("experiment"))
+                trials.append(Trial(contest, robot, _name(file, -3), number, published, of_rules, reason * short))
+    if not trials:
+        raise DataError(
+            f"{data} holds no scores as data/acrobot/real_system/CONTROLLER/experiment01/scores.csv; expected a clone "
+            "of github.com/dfki-ric-underactuated-lab/real_ai_gym_leaderboard"
+        )
+    return trials
+
+
+def _name(file: Path, part: int) -> str:
+    return _ALIASES.get(file.parts[part], file.parts[part])
+
+
+def _published(file: Path) -> float:
+    try:
+        return float(next(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))["RealAI Score"])
+    except (StopIteration, KeyError, TypeError, ValueError) as error:
+        raise DataError(f"{file} has no number under RealAI Score; expected the published score") from error
+
+
+def comparisons(data: Path, trials: Sequence[Trial]) -> list[Comparison]:
+    """Return how each contest's simulation ranks the controllers that ran on both sides, by each of its criteria."""
+    found = []
+    for criterion in SIMULATED:
+        for contest in CONTESTS:
+            for robot in BENCHMARK_PLANTS:
+                simulated = _simulated(data / "data" / robot, contest, robot, criterion)
+                mine = [t for t in trials if (t.contest, t.robot) == (contest, robot) and t.controller in simulated]
+                if mine:
+                    found.append(_comparison(criterion, mine, simulated))
+    return found
+
+
+def _simulated(folder: Path, contest: Contest, robot: str, criterion: str) -> dict[str, float]:
+    if not contest.simulation or (criterion == _NORMS and contest.version != "v2"):
+        return {}
+    below = contest.simulation.replace("simulation", "robustness") if criterion == _ROBUSTNESS else contest.simulation
+    files = {_name(file, -2): file for file in sorted((folder / below).glob(f"*/{SIMULATED[criterion]}"))}
+    if criterion == _ROBUSTNESS:  # shares of the levels held, one for each kind of disturbance
+        return {
+            name: float(np.mean([float(held) for held in load_yaml(file).values()])) for name, file in files.items()
+        }
+    if criterion == _NORMS:
+        return {name: score_of(contest, robot, file)[0] for name, file in files.items()}
+    return {name: _published(file) for name, file in files.items()}
+
+
+def _comparison(criterion: str, trials: Sequence[Trial], simulated: dict[str, float]) -> Comparison:
+    contest, robot = trials[0].contest, trials[0].robot
+    contenders = []
+    for i, name in enumerate(dict.fromkeys(one.controller for one in trials)):
+        mine = [one for one in trials if one.controller == name]
+        # Trials of one seed are compared as pairs; seed 0 is the simulation's.
+        seeds = tuple(one.number + (0 if contest.paired else i * len(trials)) for one in mine)
+        scores = np.array([[-one.score] for one in mine])
+        contenders.append(Contender(name, np.array([[-simulated[name]]]), scores, 0, 0, (0,), seeds, emulated=False))
+    ranking = rank(contenders, of_scores=True) if len(contenders) >= _LEAST else None
+    return Comparison(contest, robot, criterion, ranking, {one.name: len(one.hw) for one in contenders})
