@@ -39,8 +39,8 @@ def study_text(trials: Sequence[Trial], found: Sequence[Comparison]) -> list[str
     equal, unknown = len(computed) - len(differing), len(trials) - len(computed)
     text = [
         (
-            f"{equal} of {len(computed)} scores computed from trajectories equal the published ones (largest difference "
-            f"{largest:.1g}); {unknown} without one are taken as published."
+            f"{equal} of {len(computed)} scores computed from trajectories equal the published ones (largest "
+            f"difference {largest:.1g}); {unknown} without one are taken as published."
         )
     ]
     text += [
