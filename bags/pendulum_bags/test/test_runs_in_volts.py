@@ -1,17 +1,22 @@
 """Runs of a plant in volts: simulated, recorded, read back, and exported."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from pendulum_bags.analyse.questions.metrics import answer as metrics
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.repeats import record_simulation
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.frequency_response.record import INPUT_UNIT, record_of_joints
-from pendulum_bags.runs.run_data import read_run
+from pendulum_bags.recordings.reading import Reading
+from pendulum_bags.runs.run_data import joints_of, read_run
 from pendulum_msgs_py.contract.names import VOLTAGE_TOPICS
+from pendulum_msgs_py.plants.joint_parameters import Actuator, Motor
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant, write_plant
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.tables import export_bag
 
@@ -43,3 +48,17 @@ def test_a_run_in_volts_is_recorded_and_read_back_in_volts(tmp_path: Path) -> No
     assert commands["voltage"].tolist() == pytest.approx(run.command[: len(commands), 0].tolist())
     states = pd.read_csv(tmp_path / "tables" / "sim__joint_states.csv")
     assert {"applied_voltage", "disturbance_voltage"} <= set(states)
+
+
+def test_one_joint_in_volts_is_read_by_joint_so_that_no_page_shows_newton_metres(tmp_path: Path) -> None:
+    plant = pendulum_plant(0.05, 0.02, 1.2)
+    (own,) = plant.joints
+    link = replace(own, actuator=Actuator(1.0, motor=Motor(2.0, 0.05, 6.0, gear_ratio=14.0)))
+    file = str(write_plant(tmp_path / "link.yaml", PlantParameters(plant.mechanism, plant.values, (link,), "link")))
+    spec = replace(SPEC, plant=file, design_plant=file, disturbance={"amplitude": 0.5})
+    bag = record_simulation(tmp_path / "sim", spec)
+    (joint,) = joints_of(bag)
+    assert read_run(bag, joint=joint).window.effort_unit == "V"
+    found = metrics(Reading.of(bag), "/sim")
+    assert "max_abs_u" not in found
+    assert 0.0 < found[f"{joint}.max_abs_u"] <= 6.0

@@ -139,13 +139,21 @@ class RunData:
 def joints_of(
     path: str | os.PathLike[str], prefix: str | None = None, *, open_bag: OpenBag = read_bag
 ) -> tuple[str, ...]:
-    """Return the joints of a bag's plant of several joints, in order, or none; a DataError if it lacks the states."""
+    """Return the joints of a bag's plant of several joints, or of one in volts, in order; else none.
+
+    The pages of one joint state its torque, so that they would show volts as newton metres.
+
+    Raises:
+        DataError: The bag lacks the states.
+    """
     reading = Reading.of(path)
     bag_of: AbstractContextManager[Bag | None] = open_bag(path) if reading.is_bag else nullcontext()
     with bag_of as bag:
         if bag is not None and (prefix is not None or holds_states(bag)):
-            found = bag.joint_names(f"{find_prefix(bag, prefix)}/{names.JOINT_STATES}")
-            return found if len(found) > 1 else ()
+            space = find_prefix(bag, prefix)
+            found = bag.joint_names(f"{space}/{names.JOINT_STATES}")
+            volts = names.drive_topics(bag.topics, space) is names.VOLTAGE_TOPICS
+            return found if len(found) > 1 or volts else ()
     joints = reading.motion.joints
     return tuple(joint.name for joint in joints) if len(joints) > 1 else ()
 
