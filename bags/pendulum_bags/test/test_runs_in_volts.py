@@ -12,14 +12,25 @@ from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.repeats import record_simulation
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.frequency_response.record import INPUT_UNIT, record_of_joints
+from pendulum_bags.identification.identify import identify_joints
+from pendulum_bags.identification.joint_recordings import read_joints
 from pendulum_bags.recordings.reading import Reading
+from pendulum_bags.replay.joint_replay import replay_joints
 from pendulum_bags.runs.run_data import joints_of, read_run
 from pendulum_msgs_py.contract.names import VOLTAGE_TOPICS
+from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.joint_parameters import Actuator, Motor
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant, write_plant
+from pendulum_msgs_py.plants.plant_parameters import (
+    PlantParameters,
+    load_mechanism,
+    load_plant_file,
+    pendulum_plant,
+    write_plant,
+)
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.tables import export_bag
 
+QUBE = load_mechanism("qube_servo").with_values({"arm.inductance": 0.0})
 SPEC = RunSpec(
     plant="qube_servo", design_plant="qube_servo", duration=1.0, method="auto",
     disturbance={"amplitude": 1.0, "joints": ["arm"], "volts": True},
@@ -62,3 +73,56 @@ def test_one_joint_in_volts_is_read_by_joint_so_that_no_page_shows_newton_metres
     found = metrics(Reading.of(bag), "/sim")
     assert "max_abs_u" not in found
     assert 0.0 < found[f"{joint}.max_abs_u"] <= 6.0
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[PlantParameters, Path]:
+    """Return a plant in volts, and a recording of it under the LQR of the preset."""
+    folder = tmp_path_factory.mktemp("volts")
+    truth = QUBE.with_values({"arm.damping": 4e-4, "pendulum_inertia": 1.45e-4})
+    files = [str(write_plant(folder / f"{name}.yaml", plant)) for name, plant in (("truth", truth), ("design", QUBE))]
+    spec = replace(SPEC, plant=files[0], design_plant=files[1], duration=5.0)
+    return truth, record_simulation(folder / "sim", replace(spec, disturbance={"amplitude": 3.0, "hold_time": 0.02}))
+
+
+def test_a_plant_is_identified_from_voltages_with_its_motor_given(
+    recorded: tuple[PlantParameters, Path], tmp_path: Path
+) -> None:
+    truth, bag = recorded
+    result = identify_joints(QUBE, [read_joints(bag, QUBE.coordinates)], extras="friction")
+    assert not result.refused
+    found = result.plant()
+    assert found.coordinates.volts
+    for name in ("arm_inertia", "pendulum_inertia", "arm.damping", "pendulum.damping"):
+        assert found.value(name) == pytest.approx(truth.value(name), rel=1e-3)
+    assert found.actuators == truth.actuators
+    said = " ".join(result.sentences())
+    assert "The motor of arm was given: 0.005 per volt" in said
+    assert "voltages show only ratios" in said
+    again, provenance = load_plant_file(result.write(tmp_path / "own.yaml"))
+    assert again == found
+    # Of the damping without back EMF, as its value is.
+    low, high = provenance["intervals"]["arm.damping"]
+    assert low == pytest.approx(4e-4, rel=1e-3)
+    assert low < found.value("arm.damping") < high
+    replay = replay_joints(bag, found, window=0.1)
+    assert replay.score.share < 0.05
+    assert replay_joints(bag, QUBE, window=0.1).score.share > 2.0 * replay.score.share
+
+
+def test_an_identified_damping_below_the_back_emf_is_another_motors() -> None:
+    weaker = QUBE.torque_plant.with_values({"arm.damping": 1e-4})
+    with pytest.raises(ParameterError, match=r"arm\.damping is 0\.0001; expected at least 0\.00021, the back"):
+        weaker.with_motors(QUBE)
+    assert QUBE.torque_plant.with_motors(QUBE).packed == pytest.approx(QUBE.packed)
+
+
+def test_volts_are_no_input_of_a_plant_driven_by_a_torque_and_the_reverse(
+    recorded: tuple[PlantParameters, Path], tmp_path: Path
+) -> None:
+    with pytest.raises(DataError, match="the input of arm is a voltage; expected an effort in N m"):
+        read_joints(recorded[1], load_mechanism("furuta").coordinates)
+    torque = replace(SPEC, plant="furuta", design_plant="furuta", disturbance={"amplitude": 0.01})
+    bag = record_simulation(tmp_path / "sim", torque)
+    with pytest.raises(DataError, match="the input of arm is an effort; expected a voltage"):
+        read_joints(bag, QUBE.coordinates)

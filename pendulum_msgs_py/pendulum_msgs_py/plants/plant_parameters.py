@@ -332,6 +332,27 @@ class PlantParameters(_Pendulum):
         ]  # fmt: skip
         return PlantParameters(self.mechanism, self.values, tuple(joints), self.name)
 
+    def with_motors(self, of: PlantParameters) -> PlantParameters:
+        """Return the plant in volts whose :attr:`torque_plant` this is, by the motors of another.
+
+        Raises:
+            ParameterError: A joint's damping is less than the back EMF of its motor.
+        """
+        joints = []
+        for name, own, theirs in zip(self.coordinates.names, self.joints, of.joints, strict=True):
+            motor = None if theirs.actuator is None else theirs.actuator.motor
+            if theirs.actuator is None or motor is None or own.actuator is None:
+                joints.append(own)
+                continue
+            if own.damping < motor.damping:
+                raise ParameterError(
+                    f"{name}.damping is {own.damping:.4g}; expected at least {motor.damping:.4g}, the back EMF of its "
+                    "motor: is the motor another?"
+                )
+            actuator = replace(theirs.actuator, transport_delay=own.actuator.transport_delay)
+            joints.append(replace(own, damping=own.damping - motor.damping, actuator=actuator))
+        return PlantParameters(self.mechanism, self.values, tuple(joints), self.name)
+
     @cached_property
     def gains(self) -> Vector:
         """Effort per command of each driven joint, without dead band: 1, or with a motor [N m/V or N/V]."""

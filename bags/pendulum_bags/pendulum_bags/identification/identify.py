@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -37,7 +38,7 @@ from pendulum_bags.identification.solver import solve
 from pendulum_bags.identification.uncertainty import assess
 from pendulum_bags.identification.window_score import free_run, window_score
 from pendulum_bags.runs.datasets import Recording, distinct_names
-from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["identify", "identify_joints"]
@@ -152,6 +153,26 @@ def _moved_zero(fit: OutputErrorFit, recording: Recording, rms: float) -> tuple[
     return (found.model["angle_offset"] - fit.model["angle_offset"], own) if own < 0.8 * rms else None
 
 
+def _behind_motors(plant: PlantParameters, found: IdentificationResult) -> IdentificationResult:
+    """Return the result of the plant behind its motors as one of the plant in volts."""
+    notes = []
+    for name, actuator in zip(plant.coordinates.driven_names, plant.actuators, strict=True):
+        motor = actuator.motor
+        assert motor is not None
+        notes.append(
+            f"The motor of {name} was given: {motor.gain:.4g} per volt. Of masses, friction and motor, voltages show "
+            f"only ratios; with another motor all would be larger or smaller alike. {name}.damping contains its back "
+            f"EMF, {motor.damping:.3g}, which the plant file has apart."
+        )
+    found = replace(found, motors=plant, notes=(*notes, *found.notes))
+    if not found.refused:
+        try:
+            found.plant(plant.name)
+        except ParameterError as error:
+            return replace(found, explained=replace(found.explained, refusal=f"{REFUSED}: {error}"))
+    return found
+
+
 @threadpool_limits.wrap(limits=1, user_api="blas")
 def identify_joints(
     plant: PlantParameters,
@@ -176,6 +197,10 @@ def identify_joints(
     Raises:
         DataError: A recording is too short, of other joints, or one joint of it does not move.
     """
+    if plant.coordinates.volts:
+        fitted, kept = ([each.at_standstill(plant) for each in some] for some in (recordings, held_out))
+        options: Any = {"held_out": kept, "window": window, "extras": extras, "stride": stride}
+        return _behind_motors(plant, identify_joints(plant.torque_plant, fitted, **options))
     for recording in (*recordings, *held_out):
         recording.check(plant.coordinates)
     check_distinct(recordings, held_out)

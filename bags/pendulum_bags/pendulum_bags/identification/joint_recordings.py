@@ -17,6 +17,7 @@ from pendulum_bags.recordings.reading import Reading
 from pendulum_bags.runs.datasets import Recording, check_consistency, recording_of, unwrap
 from pendulum_msgs_py.contract.joints import Coordinates
 from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["JointRecording", "matched_joints", "read_joints"]
 
@@ -35,7 +36,7 @@ class JointRecording:
         name: Of the file, for messages.
         time: Strictly increasing, shape (s,) [s].
         position: Shape (s, n) [rad or m].
-        effort: What drives each joint, 0 where nothing does, shape (s, n) [N m or N].
+        effort: What drives each joint, 0 where nothing does, shape (s, n) [N m or N, or V].
         hold: ``zero`` or ``linear``, per joint.
         source: Where it was read.
         velocity: Shape (s, n) [rad/s or m/s]; None where it was not measured, or is made of the positions.
@@ -82,6 +83,17 @@ class JointRecording:
     def period(self) -> float:
         """Median sampling period [s]."""
         return float(np.median(np.diff(self.time)))
+
+    def at_standstill(self, plant: PlantParameters) -> JointRecording:
+        """Return the recording with the efforts at standstill of the voltages of a plant's motors; else itself."""
+        if not plant.coordinates.volts:
+            return self
+        effort = self.effort.copy()
+        for index, actuator in zip(plant.coordinates.driven, plant.actuators, strict=True):
+            assert actuator.motor is not None
+            band = actuator.motor.dead_band
+            effort[:, index] = actuator.motor.gain * (effort[:, index] - np.clip(effort[:, index], -band, band))
+        return replace(self, effort=effort)
 
     def check(self, coordinates: Coordinates) -> None:
         """Refuse a recording that cannot be of this mechanism.
@@ -141,10 +153,12 @@ def read_joints(
                 f"{reading.path}: {moved.name} is in {'m' if moved.slides else 'rad'}; expected {joint.unit} for "
                 f"{joint.name}: correct its unit in a mapping file"
             )
-        if not is_bag and drive is not None and drive.quantity != ("effort" if joint.unit == "rad" else "force"):
+        wanted = "voltage" if coordinates.volts else "effort" if is_bag or joint.unit == "rad" else "force"
+        if drive is not None and drive.quantity != wanted and (not is_bag or index in coordinates.driven):
+            article = "an" if drive.quantity[0] in "ae" else "a"
+            what = "a voltage" if coordinates.volts else f"an effort in {joint.effort_unit}"
             raise DataError(
-                f"{motion.meta['mapping']}: the input of {joint.name} is a {drive.quantity}; expected an effort in "
-                f"{joint.effort_unit}"
+                f"{motion.meta['mapping']}: the input of {joint.name} is {article} {drive.quantity}; expected {what}"
             )
         if is_bag:  # whose messages state no units, and where sensors measure an effort at passive joints
             measured = drive is not None and not drive.own_clock and index not in coordinates.driven

@@ -7,7 +7,7 @@ import json
 import platform
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +68,7 @@ class IdentificationResult:
         data: Fingerprints of the recordings.
         notes: What is to be known of the recordings and of how they were fitted, in sentences.
         excluding: That the recordings are of two machines, in a sentence; None where they may be of one.
+        motors: The plant in volts whose motors were given; None without.
     """
 
     fit: OutputErrorFit | JointFit
@@ -82,6 +83,7 @@ class IdentificationResult:
     data: tuple[dict[str, Any], ...]
     notes: tuple[str, ...]
     excluding: str | None
+    motors: PlantParameters | None = field(default=None, kw_only=True)
 
     @property
     def model(self) -> FitModel | JointModel:
@@ -137,7 +139,8 @@ class IdentificationResult:
             ParameterError: No body has the masses and inertias that were found.
         """
         assert isinstance(self.fit, JointFit)
-        return self.fit.model.identified(self.fit.free, name)
+        found = self.fit.model.identified(self.fit.free, name)
+        return found if self.motors is None else found.with_motors(self.motors)
 
     def next_step(self, plant: str) -> tuple[str, str]:
         """Return what the plant file, written, is to be tested by, in words and as a command."""
@@ -281,6 +284,11 @@ class IdentificationResult:
         model, known = self.model, plant.specs
         intervals = {n: (one.low, one.high) for n, one in self.intervals.items() if n in known and one.low < one.high}
         left_out = {f"{n} [{model.unit(n)}]": model[n] for n in self.fit.free if n not in known}
+        for joint, own in zip(plant.coordinates.names, plant.joints, strict=True):
+            name, braking = f"{joint}.damping" if len(plant.joints) > 1 else "damping", own.total_damping - own.damping
+            if braking and name in intervals:
+                low, high = intervals[name]
+                intervals[name] = (max(0.0, low - braking), high - braking)
         return intervals, {"not_in_the_plant": left_out}, []
 
 

@@ -18,7 +18,7 @@ from pendulum_rosbag.reader.joint_table import JointTable
 __all__ = ["EFFORTS", "find_prefix", "read_contract_bag"]
 
 EFFORTS = {"applied": names.APPLIED_EFFORT, "commanded": names.EFFORT_COMMAND, "measured": names.JOINT_STATES}
-"""Topics of the effort that may be asked for."""
+"""Topics of the effort that may be asked for, of a plant that is not driven in volts."""
 
 
 def find_prefix(bag: Bag, prefix: str | None = None) -> str:
@@ -59,7 +59,9 @@ def read_contract_bag(
         raise DataError(f"effort is {effort!r}; expected {', '.join(EFFORTS)}")
     with read_bag(path) as bag:
         space = find_prefix(bag, namespace)
-        topic, drive_topic = f"{space}/{names.JOINT_STATES}", f"{space}/{EFFORTS[effort]}"
+        own = names.drive_topics(bag.topics, space)
+        of_kind = {**EFFORTS, "applied": own.applied, "commanded": own.command}
+        topic, drive_topic = f"{space}/{names.JOINT_STATES}", f"{space}/{of_kind[effort]}"
         states = _table(bag, topic)
         measured = effort == "measured" or (effort == "applied" and drive_topic not in bag.topics)
         if effort == "commanded" and not (drive_topic in bag.topics and bag.topics[drive_topic].count):
@@ -110,13 +112,13 @@ def read_contract_bag(
         return times
 
     time = seconds(states.stamp_ns[rows])
-    joints = []
+    joints, carried = [], "voltage" if own is names.VOLTAGE_TOPICS else "effort"
     for column, name in enumerate(states.names):
         drive = None
         if driven is not None and (name in driven.names or len(states.names) == len(driven.names) == 1):
             stamps, first = np.unique(driven.stamp_ns, return_index=True)
             values = driven.effort[first, driven.names.index(name) if len(driven.names) > 1 else 0]
-            drive = Drive(seconds(stamps), values, "effort", "zero", own_clock=True)
+            drive = Drive(seconds(stamps), values, carried, "zero", own_clock=True)
         elif driven is None and meta["effort"] == "measured":
             drive = Drive(time, states.effort[rows, column], "effort", "linear")
         velocity = states.velocity[rows, column]

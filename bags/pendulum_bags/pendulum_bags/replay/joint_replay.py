@@ -102,10 +102,10 @@ def replay_joints(
     if not window > 0.0:
         raise DataError(f"window is {window} s; expected > 0")
     own = load_mechanism(plant) if isinstance(plant, str) else plant
-    recording = read_joints(path, own.coordinates, mapping)
+    recording = read_joints(path, own.coordinates, mapping).at_standstill(own)
     recording.check(own.coordinates)
     lag = max((actuator.time_constant for actuator in own.actuators), default=0.0)
-    model = JointModel.of(own).with_changes({DELAY: common_delay(own), LAG: lag})
+    model = JointModel.of(own.torque_plant).with_changes({DELAY: common_delay(own), LAG: lag})
     data = prepare_windows(recording, window)
     weights = 1.0 / np.maximum(line_errors(data), 1e-9)
     found = fit(model, [data], (), weights, most=12, tolerance=1e-6)
