@@ -167,6 +167,8 @@ def test_the_published_scores_of_the_real_trials_are_reproduced(shared_data):
     assert [(one.contest, one.robot, one.number) for one in differing] == [(PERTURBED, "pendubot", 8)]
     assert differing[0].reason
     found = {(one.contest.name, one.robot, one.criterion): one.ranking for one in comparisons(data, trials)}
+    first = found["first board", "pendubot", "score"]
+    assert (first.pick, first.best, first.regret.value) == ("mcpilco", "mcpilco", 0.0)
     iros, icra = (found[name, "pendubot", "score"] for name in ("IROS 2024", "ICRA 2025"))
     assert (iros.pick, iros.best, round(iros.regret.value, 3)) == ("history_sac", "ar_eapo", 0.303)
     assert (icra.pick, icra.best, round(icra.regret.value, 3)) == ("vimppi", "acados_mpc", 0.353)

@@ -14,6 +14,7 @@ import numpy as np
 from pendulum_bags.arrays import Array
 from pendulum_bags.experiments.in_process import RunArrays, simulate_plant
 from pendulum_bags.experiments.run_spec import RunSpec
+from pendulum_bags.studies.mechanism_benchmark import Criterion, bounded_share, weighted_share
 from pendulum_lqr.controller_interface.controller import controller_names
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
 from pendulum_msgs_py.contract.values import NANOSECONDS
@@ -26,7 +27,6 @@ __all__ = [
     "EXCLUDED",
     "HARDWARE",
     "PERTURBATIONS",
-    "Cost",
     "Entry",
     "contenders",
     "costs_of",
@@ -54,25 +54,16 @@ PATIENCE = 8.0
 """Wall time of the plain run beyond which the perturbations, 25 more runs, are left out; the board shows a dash [s]."""
 
 
-@dataclass(frozen=True)
-class Cost:
-    """One cost of a run, with weight and norm of the dfki underactuated-robotics leaderboards (weights sum to 1)."""
-
-    name: str
-    unit: str
-    weight: float
-    norm: float
-
-
 COSTS = (
-    Cost("time", "s", 0.2, 10.0),
-    Cost("max_torque", "N m", 0.1, 2.0),
-    Cost("energy", "J", 0.1, 100.0),
-    Cost("torque_integral", "N m s", 0.1, 20.0),
-    Cost("torque_squared", "N^2 m^2 s", 0.1, 40.0),
-    Cost("smoothness", "N m", 0.2, 4.0),
-    Cost("velocity", "rad^2/s", 0.2, 100.0),
+    Criterion("time", "time", "s", 10.0, 0.2),
+    Criterion("max_torque", "largest torque", "N m", 2.0, 0.1),
+    Criterion("energy", "energy", "J", 100.0, 0.1),
+    Criterion("torque_integral", "torque integral", "N m s", 20.0, 0.1),
+    Criterion("torque_squared", "torque cost", "N^2 m^2 s", 40.0, 0.1),
+    Criterion("smoothness", "smoothness", "N m", 4.0, 0.2),
+    Criterion("velocity", "velocity cost", "rad^2/s", 100.0, 0.2),
 )
+"""Costs of a run, with norms and weights of the dfki underactuated-robotics leaderboards (weights sum to 1)."""
 
 
 @dataclass(frozen=True)
@@ -126,8 +117,7 @@ def scores(success: bool, uptime: float, costs: Mapping[str, float]) -> dict[str
 
     v1 = success (1 - sum w x / n); v2 = success (1 - mean tanh(pi x / n)); v3 = time spent up per length of the run.
     """
-    v1 = 1.0 - sum(cost.weight * costs[cost.name] / cost.norm for cost in COSTS)
-    v2 = 1.0 - float(np.mean([math.tanh(math.pi * costs[cost.name] / cost.norm) for cost in COSTS]))
+    v1, v2 = 1.0 - weighted_share(costs, COSTS), 1.0 - bounded_share(costs, COSTS)
     return {"v1": success * v1, "v2": success * v2, "v3": uptime}
 
 

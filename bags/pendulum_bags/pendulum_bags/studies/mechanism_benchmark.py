@@ -35,12 +35,14 @@ __all__ = [
     "Criterion",
     "Published",
     "benchmark_plant",
+    "bounded_share",
     "criteria_of",
     "is_above_line",
     "line_height",
     "score_v1",
     "score_v2",
     "time_above_line",
+    "weighted_share",
 ]
 
 BENCHMARK_PLANTS = ("acrobot", "pendubot")
@@ -166,18 +168,24 @@ def criteria_of(plant: PlantParameters, times: Array, states: Array, efforts: Ar
     }
 
 
+def weighted_share(criteria: Mapping[str, float], norms: Sequence[Criterion]) -> float:
+    """Return what score v1 loses: the weighted sum of the criteria per norm."""
+    return sum(one.weight * criteria[one.name] / one.norm for one in norms)
+
+
+def bounded_share(criteria: Mapping[str, float], norms: Sequence[Criterion]) -> float:
+    """Return what score v2 loses: the mean over the criteria of tanh(pi criterion / norm)."""
+    return sum(math.tanh(math.pi * criteria[one.name] / one.norm) for one in norms) / len(norms)
+
+
 def score_v1(criteria: Mapping[str, float], duration: float) -> float:
     """Return score v1 of a swing-up of ``duration`` [s], 0 where the tip was not up at the end."""
-    if not criteria["swingup_time"] < duration:
-        return 0.0
-    return 1.0 - sum(one.weight * criteria[one.name] / one.norm for one in CRITERIA_V1)
+    return 1.0 - weighted_share(criteria, CRITERIA_V1) if criteria["swingup_time"] < duration else 0.0
 
 
 def score_v2(criteria: Mapping[str, float], duration: float, norms: Sequence[Criterion] = CRITERIA) -> float:
     """Return score v2 of a swing-up of ``duration`` [s], 0 where the tip was not up at the end."""
-    if not criteria["swingup_time"] < duration:
-        return 0.0
-    return 1.0 - sum(math.tanh(math.pi * criteria[one.name] / one.norm) for one in norms) / len(norms)
+    return 1.0 - bounded_share(criteria, norms) if criteria["swingup_time"] < duration else 0.0
 
 
 def time_above_line(plant: PlantParameters, times: Array, states: Array) -> float:

@@ -124,8 +124,8 @@ def _panel(one: Comparison, ranking: Ranking, trials: Sequence[Trial]) -> Panel:
         Trace(mean, np.arange(len(names), dtype=float), "mean, 95 %", "stable", "interval", low, high),
     ]
     ticks = [f"{name} {ranking.sim[list(ranking.names).index(name)]:.2f}" for name in names]
-    title = f"{one.contest.name}, {one.robot}"
-    x_label = f"score {one.contest.version} on the machine [-]"
+    # Stacked panels share the label of the x axis.
+    title, x_label = f"{one.contest.name}, {one.robot}: score {one.contest.version}", "score on the machine [-]"
     return Panel(x_label, "", traces, title=title, y_ticks=ticks, y_range=(-0.5, len(names) - 0.4))
 
 
