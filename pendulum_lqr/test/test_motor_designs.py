@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from pendulum_lqr.design_command.design_cli import main
 from pendulum_lqr.linear.design import output_lqr
 from pendulum_lqr.linear.model import holding_effort, linearise
 from pendulum_msgs_py.dynamics.runge_kutta import along_functions, rk4_joints
+from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.joint_parameters import Actuator, Motor
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 
@@ -125,5 +127,15 @@ def test_the_design_command_says_that_its_gains_are_in_volts(capsys: pytest.Capt
     assert main(["--preset", "qube_servo"]) == 0
     said = capsys.readouterr().out
     assert "u* = 0 V" in said
-    assert "K in volts: the motor of arm gives 0.005 per volt, damps by 0.00021" in said
+    assert "K in V per unit of its state: the motor of arm gives 0.005 N m/V, damps by 0.00021 N m s/rad" in said
     assert math.isclose(float(said.split("K = [")[1].split(",")[0]), -19.533, abs_tol=1e-3)
+
+
+def test_a_playback_is_in_the_unit_of_its_plant_and_refuses_a_file_in_the_other(tmp_path: Path) -> None:
+    file = tmp_path / "input.csv"
+    rest = (0.0, 0.0)
+    for header, plant, other in (("time,voltage", QUBE, "furuta"), ("time,effort", load_mechanism("furuta"), "qube")):
+        file.write_text(f"{header}\n0.0,0.05\n1.0,0.0\n")
+        assert make_controller("playback", plant, PERIOD, {"file": str(file)}).efforts(0.5, rest, rest) == (0.05,)
+        with pytest.raises(DataError, match=f"plant '{other}.* is driven in (V|N m); expected a header with"):
+            make_controller("playback", QUBE if other == "qube" else load_mechanism(other), PERIOD, {"file": str(file)})

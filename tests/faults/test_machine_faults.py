@@ -247,6 +247,17 @@ def test_drives_that_cannot_be_watched_or_differ_in_their_delay_are_refused(
         Machine(str(file))
 
 
+def test_limits_of_a_motor_in_volts_reach_the_drive_in_volts_and_pushes_in_newton_metres() -> None:
+    machine = Machine("qube_servo", effort_limit=5.0)
+    assert machine.emulated.drives[0].limit * machine.emulated.constants[0].supply_voltage == pytest.approx(5.0)
+    assert machine.bridge.sample is not None
+    push = JointCommand(machine.bridge.sample.stamp_ns, (1e3,), "hand", ("arm",))
+    assert machine.supervisor.offer(Input.PUSH, push, machine.clock.now_ns()) is None
+    machine.cycles(1)
+    # Ten times the effort of 10 V at standstill.
+    assert machine.outcomes[-1].drive.push[0] == pytest.approx(0.5)
+
+
 def test_positions_of_several_joints_are_refused_for_one() -> None:
     values = {spec.name: spec.default for spec in SPECS} | {"initial_positions": [0.0, 1.0]}
     with pytest.raises(ParameterError, match="initial_positions is for several joints"):

@@ -27,8 +27,8 @@ class Playback(BaseController):
 
     Args:
         times: Times since the start, increasing, shape (n,) [s].
-        efforts: Of m driven joints, shape (n,) or (n, m) [N m or N].
-        effort_limits: Largest efforts, shape (m,) [N m or N].
+        efforts: Of m driven joints, shape (n,) or (n, m) [N m or N, or V].
+        effort_limits: Largest efforts, shape (m,), in the same unit.
 
     Raises:
         DataError: Shapes differ, values are not finite, or times do not increase.
@@ -37,13 +37,15 @@ class Playback(BaseController):
     FEEDBACK = False
     TIME_INVARIANT = False
     SAMPLED = False
+    IN_VOLTS = True
     SUMMARY = "open loop: plays recorded efforts"
     PARAMETERS = (
         ParameterSpec(
             "file",
             "",
             "",
-            "CSV file with a header line, and the columns time [s] and the effort of each driven joint [N m or N].",
+            "CSV file with a header line, and the columns time [s] and the effort of each driven joint [N m or N]. For "
+            "a plant in volts these are voltages [V], and the header says so.",
         ),
     )
 
@@ -69,12 +71,19 @@ class Playback(BaseController):
         """Return the playback of the parameter ``file``."""
         if p.get("set_point", 0.0) != 0.0:
             raise DataError(f"set_point is {p['set_point']:g} rad; expected 0: a recorded torque aims at no angle")
-        limits = (p["effort_limit"],) if plant.is_pendulum else plant.effort_limits
-        columns = "time [s], effort [N m]" if plant.is_pendulum else f"time [s] and {len(limits)} efforts"
+        limits = (p["effort_limit"],) if plant.is_pendulum else plant.command_limits
+        volts = plant.coordinates.volts
+        what = "voltages" if volts else "efforts"
+        columns = "time [s], effort [N m]" if plant.is_pendulum else f"time [s] and {len(limits)} {what}"
         if not p["file"]:
             raise DataError(f"file is empty; expected the path of a CSV with the columns {columns}")
         path = Path(p["file"]).expanduser()
-        rows = read_text(path, "playback file", limit=_LARGEST_FILE).splitlines()[1:]
+        header, *rows = read_text(path, "playback file", limit=_LARGEST_FILE).splitlines() or [""]
+        if ("volt" in header.lower() or "[V]" in header) != volts:
+            raise DataError(
+                f"playback file {path} has the header {header!r}, and plant {plant.name!r} is driven in "
+                f"{plant.coordinates.drive_unit}; expected a header with{'' if volts else 'out'} voltage"
+            )
         values: list[list[float]] = []
         for number, row in enumerate(rows, start=2):
             if not row.strip():

@@ -274,9 +274,13 @@ class _Table:
             a, b = model.A[1], model.B[1, 0]
             what = f"A = [[0, 1], [{a[0]:.2f}, {a[1]:.2f}]], B = [0, {b:.2f}],"
         lines = [f"plant {self.plant.name} at {at}: {what} u* = {held}", *hidden_and_late(model)]
-        for name, motor in zip(self.plant.coordinates.driven_names, self.plant.actuators, strict=True):
-            if (of := motor.motor) is not None:
-                lines.append(f"K in volts: the motor of {name} gives {of.gain:.4g} per volt, damps by {of.damping:.4g}")
+        for index, actuator in zip(self.plant.coordinates.driven, self.plant.actuators, strict=True):
+            if (of := actuator.motor) is not None:
+                joint = joints[index]
+                lines.append(
+                    f"K in V per unit of its state: the motor of {joint.name} gives {of.gain:.4g} "
+                    f"{joint.effort_unit}/V, damps by {of.damping:.4g} {joint.damping_unit}"
+                )
         if not self.plant.is_pendulum and self.plant.has_dry_friction:
             lines.append(
                 "dry friction has no derivative at rest and is not in the model: simulate the loop to see its cost"
