@@ -434,3 +434,13 @@ REFUSED: list[Refused] = [
 
 def test_a_bad_parameter_at_start_ends_the_program_with_one_sentence(domain_id):
     assert not_refused(REFUSED) == []
+
+
+def test_a_recorded_disturbance_in_another_unit_is_refused(domain_id, tmp_path):
+    refused = []
+    for header, volts in (("time,torque", "true"), ("time,voltage", "false")):
+        file = tmp_path / f"{volts}.csv"
+        file.write_text(f"{header}\n0.0,1.0\n0.1,0.0\n")
+        given = ["kind:=from_bag", f"file:={file}", f"volts:={volts}"]
+        refused.append((("pendulum_lqr", "disturbance"), given, f"has the header '{header}', and volts is"))
+    assert not_refused(refused) == []

@@ -258,6 +258,27 @@ def test_limits_of_a_motor_in_volts_reach_the_drive_in_volts_and_pushes_in_newto
     assert machine.outcomes[-1].drive.push[0] == pytest.approx(0.5)
 
 
+def test_a_geared_motor_in_volts_that_is_reversed_at_speed_is_no_fault(tmp_path: Path) -> None:
+    geared = load_mechanism("qube_servo").with_values({"arm.gear_ratio": 14.0})
+    machine = Machine(
+        str(write_plant(tmp_path / "geared.yaml", geared)), upright=0.0, start_effort_limit=0.0, effort_limit=6.0
+    )
+    assert machine.arm() == ""
+    fastest = strongest = 0.0
+    for volts in 60 * [6.0] + 10 * [-6.0]:
+        machine.cycles(1)
+        assert machine.bridge.sample is not None
+        machine.answer(machine.bridge.sample, (volts,))
+        fastest, strongest = (
+            max(a, abs(b[0])) for a, b in zip((fastest, strongest), machine.emulated.state[1:], strict=True)
+        )
+    assert machine.bridge.faults == {}, machine.supervisor.reason
+    assert machine.supervisor.mode is Mode.EFFORT
+    assert fastest > 4.0
+    # More than that of 6 V at standstill, by the back EMF.
+    assert strongest > 1.5 * 6.0 * geared.gains[0]
+
+
 def test_positions_of_several_joints_are_refused_for_one() -> None:
     values = {spec.name: spec.default for spec in SPECS} | {"initial_positions": [0.0, 1.0]}
     with pytest.raises(ParameterError, match="initial_positions is for several joints"):

@@ -208,18 +208,26 @@ def _signals(values: Mapping[str, Any]) -> tuple[Disturbance, ...]:
         return tuple(make_disturbance({**own, "seed": own["seed"] + k}) for k in range(len(joints)))
     if len(joints) > 1:
         raise ParameterError(f"kind is 'from_bag' for {', '.join(joints)}; expected one joint, as the file does")
-    return (make_disturbance(own, _read_recording(values["file"])),)
+    return (make_disturbance(own, _read_recording(values["file"], volts=values["volts"])),)
 
 
-def _read_recording(file: str) -> Disturbance:
+def _read_recording(file: str, *, volts: bool) -> Disturbance:
     if not file:
         raise ParameterError("kind is 'from_bag' without a file; expected -p file:=PATH of a CSV with time and torque")
-    rows = read_text(Path(file).expanduser(), "recorded disturbance", limit=200_000_000).splitlines()[1:]
+    header, *rows = read_text(Path(file).expanduser(), "recorded disturbance", limit=200_000_000).splitlines() or [""]
+    if ("volt" in header.lower() or "[V]" in header) != volts:
+        raise DataError(
+            f"recorded disturbance {file} has the header {header!r}, and volts is {volts}; expected a header with"
+            f"{'' if volts else 'out'} voltage"
+        )
     try:
         table = np.array([[float(cell) for cell in row.split(",")[:2]] for row in rows if row.strip()])
         times, torques = table[:, 0], table[:, 1]
     except (ValueError, IndexError) as error:
-        raise DataError(f"recorded disturbance {file}: {error}; expected the columns time [s], torque [N m]") from error
+        raise DataError(
+            f"recorded disturbance {file}: {error}; expected the columns time [s], "
+            f"{'voltage [V]' if volts else 'torque [N m]'}"
+        ) from error
     return from_bag(np.round(times * NANOSECONDS).astype(np.int64), torques)
 
 
