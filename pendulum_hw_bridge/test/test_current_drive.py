@@ -8,7 +8,7 @@ import pytest
 
 from pendulum_hw_bridge.bridge.assembly import for_plant
 from pendulum_hw_bridge.bridge.node_specs import SPECS
-from pendulum_hw_bridge.drive.current_drive import CurrentCheck, CurrentMapping
+from pendulum_hw_bridge.drive.current_drive import CurrentCheck, CurrentMapping, VoltageMapping
 from pendulum_hw_bridge.drive.effort_mapping import EffortStrategy
 from pendulum_hw_bridge.drive.motor_state import MotorState
 from pendulum_hw_bridge.emulation.quasi_direct_drive import QuasiDirectDrive
@@ -39,6 +39,15 @@ def test_nothing_but_an_effort_leaves_the_bridge() -> None:
     assert mapping().strategy is Strategy.PARALLEL_PWM
     assert mapping().limited_gains(24.0) is DEFAULT_GAINS[3]
     assert mapping().largest_effort(9.0) == mapping().effort_limit
+
+
+@pytest.mark.parametrize("supply", [12.0, 24.0])
+def test_a_voltage_is_a_duty_of_the_supply_as_measured(supply: float) -> None:
+    drive, motor = QuasiDirectDrive().constants(Joint("elbow"), 6.0), MotorState(supply)
+    volts = VoltageMapping(EffortStrategy.DIRECT_PWM, drive)
+    assert volts.command(6.0, motor).pwm == 6.0 / supply
+    assert volts.effort_of(volts.command(6.0, motor), motor, math.nan) == pytest.approx(6.0)
+    assert volts.effort_of(Command(), motor, 0.5) == 0.0
 
 
 def faults(check: CurrentCheck, *pairs: tuple[float, float]) -> list[str]:
