@@ -463,3 +463,16 @@ def test_a_trajectory_file_gives_back_what_was_written_and_says_what_is_wrong_wi
     catch = default_catch(plant)
     with pytest.raises(ParameterError, match="has the joints shoulder, elbow and 1 motors; expected cart, pole and 1"):
         MechanismTvlqr(DT, trajectory, catch, q=Q, r=R)
+
+
+@pytest.mark.parametrize("name", ["nmpc", "ilqr"])
+def test_plans_are_for_several_joints(name: str, tmp_path: Path) -> None:
+    stopped = tmp_path / "stopped.yaml"
+    stopped.write_text(
+        "format: pendulum_plant/2\nname: stopped\nmodel: pendulum\nparameters:\n"
+        "  inertia: {value: 0.1, unit: kg m^2}\n  gravity: {value: 1.0, unit: N m}\n"
+        "joints:\n  pendulum_joint:\n    upper_stop: {value: 4.0, unit: rad}\n"
+        "    actuator: {effort_limit: {value: 2.0, unit: N m}}\n"
+    )
+    with pytest.raises(ParameterError, match="plant 'stopped' has one joint; expected several"):
+        make_controller(name, load_mechanism(str(stopped)), DT)

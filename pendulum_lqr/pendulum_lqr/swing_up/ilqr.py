@@ -32,7 +32,7 @@ from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 
-__all__ = ["IlqrPlan", "IlqrProblem", "IlqrWeights"]
+__all__ = ["IlqrPlan", "IlqrProblem", "IlqrWeights", "require_several_joints"]
 
 Array = NDArray[np.float64]
 
@@ -77,6 +77,14 @@ class IlqrPlan(NamedTuple):
     converged: bool
 
 
+def require_several_joints(plant: PlantParameters) -> None:
+    """Raise a ParameterError for a plant of one joint, whose matrices the solver does not have."""
+    if len(plant.joints) == 1:
+        raise ParameterError(
+            f"plant {plant.name!r} has one joint; expected several: energy_swing_up and time_optimal follow no file"
+        )
+
+
 @dataclass(frozen=True)
 class IlqrProblem:
     """Problem of one plant; dry friction, stops, lag and delay are neglected.
@@ -86,6 +94,9 @@ class IlqrProblem:
         weights: Of the cost.
         terminal: S, shape (2n, 2n).
         limit: Usable share of the effort limits.
+
+    Raises:
+        ParameterError: The plant has one joint.
     """
 
     plant: PlantParameters
@@ -93,6 +104,9 @@ class IlqrProblem:
     weights: IlqrWeights
     terminal: Array
     limit: float = 1.0
+
+    def __post_init__(self) -> None:
+        require_several_joints(self.plant)
 
     def solve(
         self, q: Vector, v: Vector, u: Vector, efforts: Array, iterations: int, around: IlqrPlan | None = None

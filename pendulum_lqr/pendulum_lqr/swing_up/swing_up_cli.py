@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from pendulum_lqr.swing_up.ilqr import IlqrWeights
+from pendulum_lqr.swing_up.ilqr import IlqrWeights, require_several_joints
 from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import counting_bar
@@ -46,10 +46,7 @@ def swing_up(
     from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 
     plant = load_mechanism(preset)
-    if plant.is_pendulum:
-        raise ParameterError(
-            f"plant {plant.name!r} has one joint; expected several: energy_swing_up and time_optimal follow no file"
-        )
+    require_several_joints(plant)
     try:
         values = IlqrWeights(*(float(part) for part in weights.split(",")))
     except (TypeError, ValueError) as error:
