@@ -24,6 +24,9 @@ __all__ = [
     "time_cell",
 ]
 
+_ANY_GAIN = 1e6
+"""Gain margin from which it is limited by rounding alone."""
+
 
 class RowTable(WholeTable):
     """A table of combinations, one of them marked.
@@ -48,7 +51,7 @@ class RowTable(WholeTable):
 def margin_cells(margins: Margins) -> list[str]:
     """Return the cells of gain margins up and down, phase margin, delay margin and modulus."""
     return [
-        "any" if math.isinf(margins.gain_up) else f"{margins.gain_up:.3f}",
+        "any" if margins.gain_up > _ANY_GAIN else f"{margins.gain_up:.3f}",
         f"{margins.gain_down:.4f}",
         f"{math.degrees(margins.phase):.2f}\u00b0",
         time_cell(margins.delay),
