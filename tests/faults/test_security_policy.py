@@ -99,6 +99,8 @@ def test_nodes_do_what_the_policy_allows_and_nothing_else(tmp_path: Path, hosts:
             absent = {"/sim/recorder/status", "/hw/procedure/start", "/sim/joint_commands"}
             # Heard where a hold-to-run switch is wanted.
             absent |= {"/hw/enable_input", "/sim/enable_input"}
+            # Of plants in volts.
+            absent |= {f"{side}/{topic}" for side in PLANTS for topic in names.VOLTAGE_TOPICS}
             found: dict[str, tuple[Any, Any]] = {}
 
             def as_allowed() -> bool:

@@ -46,7 +46,7 @@ _ANY = "{any}/"
 _RECORDED = "{recorded}"
 """All topics that a side's nodes publish there."""
 _READ_PARAMETERS = (_ANY + "list_parameters", _ANY + "get_parameters")
-_WATCHED = (*_APPLIED, *_COMMANDS, *_DISTURBANCES, names.PUSH)
+_WATCHED = (*names.EFFORT_TOPICS, names.PUSH)
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ NODES: dict[str, Permissions] = {
     "console": Permissions(
         subscribe=(
             names.DIAGNOSTICS,
-            *(_SIDE + name for name in (names.EVENTS, names.JOINT_STATES, *_COMMANDS, *_DISTURBANCES, *_APPLIED)),
+            *(_SIDE + name for name in (names.EVENTS, names.JOINT_STATES, *names.EFFORT_TOPICS)),
         ),
         request=(
             *_READ_PARAMETERS,
