@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -258,6 +259,16 @@ def test_a_duty_that_stands_still_for_four_records_while_the_setpoint_moves_is_s
     checked.check.reset()
     assert [see(move), see(0.0), see(move)] == ["", "", ""]
     assert see(0.0) == "output_disagreement"
+
+
+def test_a_setpoint_that_may_be_in_force_a_record_late_shows_no_stuck_output() -> None:
+    checked = Checked()
+    kept, new = Command(position=0.5), Command(position=0.5 + 2.0**-9)
+    # The newest may not have arrived: the duty of the one before explains each record, and no two of three moving ones.
+    assert not any(checked.see(0.25, new if number % 2 else kept, kept) for number in range(9))
+    moving = [Command(position=0.5 + number * 2.0**-9) for number in range(6)]
+    faults = [checked.see(0.25, after, before) for before, after in pairwise(moving)]
+    assert faults[-1] == "output_disagreement"
 
 
 def test_a_setpoint_that_moves_the_duty_by_no_more_than_two_steps_shows_no_stuck_output() -> None:
