@@ -344,7 +344,7 @@ def test_command_prints_the_verdict_last(folder: Path, capsys: pytest.CaptureFix
     ("arguments", "message"),
     [
         (["nowhere", "nowhere"], "nowhere"),
-        (["one"], "got 1 paths"),
+        (["one"], "got one; "),
         (["a", "b", "--margin", "wide=1deg"], "margin has no 'wide'"),
         (["a", "b", "--margin", "delay=8ms", "--margin", "delay=9ms"], "margin delay is stated twice; expected once"),
     ],
