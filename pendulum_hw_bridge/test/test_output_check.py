@@ -383,3 +383,17 @@ def test_a_duty_with_what_is_asked_for_or_one_too_small_to_tell_is_not_stuck(
 def test_a_torque_loop_that_was_just_switched_off_is_still_one() -> None:
     checked = Opposed()
     assert not any(checked.at(number, 0.1, 0.019 * (number % 2)) for number in range(9))
+    # The same where each candidate moves as the other.
+    both = Checked()
+    for number in range(9):
+        position = 0.2 + 0.01 * (number % 2)
+        assert both.see(0.1, Command(position=position), Command(position=position, effort=0.0)) == ""
+
+
+def test_the_duty_that_is_asked_for_is_reported_at_the_nominal_supply() -> None:
+    check = Checked(replace(GAINS, velocity=PidGains(feed_forward=0.5))).check
+    records = [feedback_record(voltage=16.0, pwm_command=0.5 + 1e-3 * number) for number in range(3)]
+    *_, fault = [check.check(each, Strategy.PARALLEL_PWM, [Command(velocity=1.0)]) for each in records]
+    nominal = 0.5 * check.mapping.back_emf_pwm(1.0, 32.0)
+    assert fault is not None
+    assert f"setpoints and gains ask for {nominal:.4f}" in fault.message
