@@ -108,7 +108,7 @@ TARGETS: tuple[Target, ...] = (
     Target("pendulum_hw_bridge.drive.motor_state", ("MotorWatch",), (f"{_BRIDGE}/test_motor_state.py",)),
     Target(
         "pendulum_hw_bridge.drive.output_check",
-        ("OutputCheck", "_output", "_memoryless", "_clamped"),
+        ("OutputCheck", "_output", "_moves", "_memoryless", "_clamped"),
         (f"{_BRIDGE}/test_output_check.py",),
     ),
     Target(
