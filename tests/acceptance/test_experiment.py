@@ -26,8 +26,8 @@ from pendulum_testing.processes import ProcessGroup, RunningProgram
 pytestmark = pytest.mark.timeout(600)
 
 NOISE = 5.0
-SPEED = 0.4
-"""Mean speed of the ramps [rad/s]; at the default each takes 16 s. To a busy bridge a fast one is a stuck duty."""
+SPEED = 0.2
+"""Mean speed of the ramps [rad/s], the default: faster ones look like a stuck duty to a busy bridge."""
 SHORT = f"--ramp-speed {SPEED} --contenders 3 --seeds 1 --periods 3"
 """Each step of the default run, with less of it."""
 
