@@ -21,8 +21,8 @@ def start_robot(processes: ProcessGroup, name: str = "robot", file: str = "plain
 
 
 def adopt(processes: ProcessGroup, namespace: str, **changes: object) -> RunningProgram:
-    """Start the adopter in a namespace, told how this robot counts; further parameters as given."""
-    told = {
+    """Start the adopter in a namespace, configured for how this robot counts; further parameters as given."""
+    mapping = {
         "states": "/robot/joint_states",
         "commands": EFFORTS,
         "joint": "shoulder",
@@ -33,12 +33,12 @@ def adopt(processes: ProcessGroup, namespace: str, **changes: object) -> Running
         "state_timeout": 0.5,
         **changes,
     }
-    return _adopt(processes, namespace, told)
+    return _adopt(processes, namespace, mapping)
 
 
 def adopt_cart_pole(processes: ProcessGroup, namespace: str) -> RunningProgram:
     """Start the adopter of the plain cart-pole: other order and signs, a further joint, commands of the slide alone."""
-    told: dict[str, object] = {
+    mapping: dict[str, object] = {
         "states": "/robot/joint_states",
         "commands": EFFORTS,
         "plant": "cart_pole",
@@ -47,11 +47,11 @@ def adopt_cart_pole(processes: ProcessGroup, namespace: str) -> RunningProgram:
         "command_joints": "[slide]",
         "state_timeout": 0.5,
     }
-    return _adopt(processes, namespace, told)
+    return _adopt(processes, namespace, mapping)
 
 
-def _adopt(processes: ProcessGroup, namespace: str, told: dict[str, object]) -> RunningProgram:
-    arguments = [item for name, value in told.items() for item in ("-p", f"{name}:={value}")]
+def _adopt(processes: ProcessGroup, namespace: str, mapping: dict[str, object]) -> RunningProgram:
+    arguments = [item for name, value in mapping.items() for item in ("-p", f"{name}:={value}")]
     return processes.start("pendulum_sim", "adopt", "--ros-args", "-r", f"__ns:={namespace}", *arguments)
 
 

@@ -35,7 +35,7 @@ def real_ai_gym(
 ) -> None:
     """Score all trials of contests on real acrobots and pendubots, and rank controllers by the contests' simulation.
 
-    Example: python -m pendulum_bags study real_ai_gym --data real_ai_gym_leaderboard --out /tmp/real_ai_gym
+    Example: python -m pendulum_bags study real_ai_gym --data real_ai_gym_leaderboard --out contests
     """
     from pendulum_bags.studies.real_ai_gym import comparisons, read_trials
     from pendulum_bags.studies.real_ai_gym_page import study_tables, study_text, to_json, write_study

@@ -42,7 +42,7 @@ def record_held(
 ) -> None:
     """Record a running plant of a side under noise, as its settings describe, and disarm it.
 
-    It is armed once somebody holds it so near upright, and so still, that the controller would ask for little; a
+    It is armed once a person holds it so near upright, and so still, that the controller would ask for little; a
     commanded effort acts from then on only.
 
     Raises:

@@ -148,9 +148,9 @@ class JointSettings(Sides):
         return {RUN_RECORD: {**self.run(side).metadata()[RUN_RECORD], **own, "experiment": "joints"}}
 
 
-def driven_joint(plant: str | PlantParameters, joint: str = "") -> str:
+def driven_joint(plant: str, joint: str = "") -> str:
     """Return the joint that has the noise: the named or the first driven one; a ParameterError if there is none."""
-    loaded = plant if isinstance(plant, PlantParameters) else load_mechanism(plant)
+    loaded = load_mechanism(plant)
     driven = loaded.coordinates.driven_names
     if not driven:
         raise ParameterError(f"plant {loaded.name!r} has no driven joint; expected an actuator at one of its joints")
@@ -159,10 +159,10 @@ def driven_joint(plant: str | PlantParameters, joint: str = "") -> str:
     return joint or driven[0]
 
 
-def default_amplitude(plant: str | PlantParameters, joint: str = "") -> float:
+def default_amplitude(plant: str, joint: str = "") -> float:
     """Return the largest command of the noise, a share of its joint's limit [N m or N, or V]."""
-    loaded = plant if isinstance(plant, PlantParameters) else load_mechanism(plant)
-    index = loaded.coordinates.driven_names.index(driven_joint(loaded, joint))
+    loaded = load_mechanism(plant)
+    index = loaded.coordinates.driven_names.index(driven_joint(plant, joint))
     return loaded.command_limits[index] / LIMIT_PER_NOISE
 
 
