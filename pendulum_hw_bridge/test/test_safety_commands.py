@@ -11,6 +11,7 @@ from pendulum_hw_bridge.drive.effort_mapping import EffortMapping, EffortStrateg
 from pendulum_hw_bridge.drive.output_check import OutputCheck
 from pendulum_hw_bridge.drive.safety import SafetyMonitor
 from pendulum_hw_bridge.port.actuator import Command, Strategy
+from pendulum_hw_bridge.port.gains import GainSet, PidGains
 from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 from pendulum_testing.feedback_records import feedback_record
 from pendulum_testing.watched_monitor import DRIVETRAIN, LIMITS, MILLISECOND, PERIOD, STEP, Watched
@@ -247,6 +248,22 @@ def test_the_torque_of_the_motor_is_watched_from_the_second_period_of_a_strategy
     watched.monitor.stopped()
     assert not any(watched.see(pwm_command=0.9) for _ in range(5))
     assert told(Strategy.PARALLEL_PWM) == ["", "", "motor_effort"]
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_a_setpoint_that_the_record_reports_as_late_explains_a_constant_duty_and_no_other_does(late: bool) -> None:
+    watched = Watched()
+    gains = GainSet(3, PidGains(kp=1.0), PidGains(), PidGains())
+    watched.monitor.output = OutputCheck(EffortMapping(EffortStrategy.DIRECT_PWM, DRIVETRAIN, gains=gains))
+    held = {"position_command": 0.0, "velocity_command": 0.0, "effort_command": math.nan, "pwm_command": 0.0}
+    settled(watched, Strategy.PARALLEL_PWM, held, position=0.0, velocity=0.0)
+    faults = []
+    for number in range(1, 5):
+        sent = number * 2.0**-11
+        watched.tell(Strategy.PARALLEL_PWM, position=sent, velocity=0.0)
+        # The late record reports a setpoint that was sent; the other one a position near it that was not.
+        faults.append(watched.see(**{**held, "position_command": 0.0 if late else sent - 2e-5}))
+    assert faults == (["", "", "", ""] if late else ["", *["output_disagreement"] * 3])
 
 
 # --- winding current -------------------------------------------------------------------------------------------

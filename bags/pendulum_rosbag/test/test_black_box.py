@@ -8,11 +8,14 @@ from pathlib import Path
 
 import pytest
 from rclpy.serialization import serialize_message
+from sensor_msgs.msg import JointState
 from std_srvs.srv import SetBool, Trigger
 
+from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs import graph
+from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import event_message
 from pendulum_rosbag.reader.bag import read_bag
 from pendulum_rosbag.recorder.black_box import BlackBox
@@ -80,6 +83,10 @@ def test_an_e_stop_of_the_emulated_x5_9_leaves_a_bag_whose_path_is_in_diagnostic
     processes.start(plant.package, plant.executable, *plant.ros_arguments())
     with closing(PlantPeer("/lab")) as peer:
         peer.patience = 120.0
+        applied: list[float] = []
+        peer.node.create_subscription(
+            JointState, names.APPLIED_EFFORT, lambda message: applied.append(message.effort[0]), qos.STATE
+        )
         peer.until(lambda: peer.states, "the plant")
         recorder.wait_for_output("subscribed to /lab/events", 120.0)
         for number in (1, 2):
@@ -88,7 +95,9 @@ def test_an_e_stop_of_the_emulated_x5_9_leaves_a_bag_whose_path_is_in_diagnostic
             arm = SetBool.Request(data=True)
             peer.until(lambda arm=arm: peer.call(SetBool, "bridge/arm", arm).success, "an armed plant")  # type: ignore[misc]
             peer.torque = 1.0
-            peer.until(lambda: peer.diagnostics.get("reason", "").startswith("commanded"), "torque")
+            # Diagnostics report the commander before the first period that applies its torque has been recorded.
+            applied.clear()
+            peer.until(lambda: 1.0 in applied, "torque")
             assert peer.call(Trigger, "bridge/e_stop", Trigger.Request()).success
             bags = [folder, folder.with_name("stops_2")][:number]
             recorder.wait_for_output(rf"recorded .* in {bags[-1]}[,;]", 120.0)
