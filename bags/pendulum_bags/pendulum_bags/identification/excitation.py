@@ -16,12 +16,13 @@ from pathlib import Path
 import numpy as np
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.identification.covariance import without
-from pendulum_bags.identification.joint_fit import Windows, motions, prepare_windows, sensitivity
+from pendulum_bags.identification.covariance import information
+from pendulum_bags.identification.joint_fit import WeightedErrors, motions, prepare_windows
 from pendulum_bags.identification.joint_model import DELAY, LAG, JointModel
 from pendulum_bags.identification.joint_recordings import JointRecording
-from pendulum_bags.identification.model import BOUNDS, INDEX, from_plant
+from pendulum_bags.identification.model import BOUNDS, from_plant
 from pendulum_bags.identification.problem import prepare, simulate
+from pendulum_bags.identification.solver import angle_motions
 from pendulum_bags.runs.datasets import Recording
 from pendulum_lqr.linear.model import linearise
 from pendulum_msgs_py.errors import DataError
@@ -107,6 +108,8 @@ class _Problem:
     limits: Limits
     parameters: tuple[str, ...]
     noise: float
+    nuisance: tuple[str, ...]
+    sizes: tuple[float, ...]
     joint: int = 0
 
 
@@ -146,11 +149,14 @@ def design_excitation(
             raise DataError(f"kind is {kind!r}; expected one of {', '.join(KINDS)}, or best")
     if plant.coordinates.volts:
         raise DataError(f"plant {plant.name!r} is driven in volts; expected one that is driven by an effort")
+    nuisance: tuple[str, ...]
     if plant.is_pendulum:
-        known, usual = [name for name in BOUNDS if name != "input_gain"], _OF_ONE
+        known, usual, nuisance = [name for name in BOUNDS if name != "input_gain"], _OF_ONE, (*_OF_ONE, *NUISANCE)
     else:
-        known = [*JointModel.of(plant).fitted()]
+        model = JointModel.of(plant)
+        known = [*model.fitted()]
         usual = tuple(name for name in known if not name.endswith(_FRICTION) or plant.value(name) > 0.0)
+        nuisance = (*known, *(name for group in model.own_offsets for name in group))
     parameters = tuple(parameters) or usual
     for name in parameters:
         if name not in known:
@@ -168,8 +174,10 @@ def design_excitation(
         plant,
         np.arange(round(duration / period), dtype=np.float64) * period,
         limits,
-        tuple(parameters),
+        parameters,
         noise,
+        nuisance,
+        tuple(_size(plant, name) for name in parameters),
         plant.coordinates.driven[driven.index(joint) if joint else 0],
     )
     rng = np.random.default_rng(seed)
@@ -189,6 +197,13 @@ def design_excitation(
         if found is not None and found.score < best[0].score:
             best = found, genes
     return best[0]
+
+
+def _size(plant: PlantParameters, name: str) -> float:
+    """Return what the error of a parameter is a share of; of one that is 0 in a pendulum, a share of its gravity."""
+    if plant.is_pendulum:
+        return abs(from_plant(plant)[name]) or 0.05 * max(plant.gravity, 1e-3)
+    return JointModel.of(plant).size(name)
 
 
 def _evaluate(problem: _Problem, kind: str, genes: Array) -> Excitation | None:
@@ -240,23 +255,45 @@ def _rates(plant: PlantParameters) -> tuple[float, float]:
 
 
 def _motion(problem: _Problem, effort: Array) -> tuple[Array, Array]:
-    if not problem.plant.is_pendulum:
-        return _joint_motion(problem, effort)
-    recording = Recording(problem.time, np.zeros_like(problem.time), None, effort, hold="zero")
-    piece = replace(prepare(recording, None), states=np.zeros((1, 2)))
-    result = simulate(from_plant(problem.plant), piece)
-    return result.theta, result.omega
+    """Return positions and velocities, shape (n, joints), of a plant that hangs at first."""
+    time, count = problem.time, len(problem.plant.joints)
+    if problem.plant.is_pendulum:
+        piece = replace(prepare(_recorded(problem, effort), None), states=np.zeros((1, 2)))
+        result = simulate(from_plant(problem.plant), piece)
+        return result.theta[:, None], result.omega[:, None]
+    # All of it is one window, which begins a little after the recording: both begin at rest.
+    lead = time[1] * np.arange(-_LEAD, 0)
+    whole = replace(problem, time=np.concatenate([lead, time]) - lead[0])
+    padded = _joint_recording(whole, np.concatenate([np.zeros(_LEAD), effort]), np.zeros((time.size + _LEAD, count)))
+    data, model = prepare_windows(padded, float(whole.time[-1]) + 1.0), _joint_model(problem.plant)
+    path = motions(model, model.vector[None], data, np.zeros((1, 1, 2 * count)))[0, 0][data.inside[0]]
+    return path[-time.size :, :count], path[-time.size :, count:]
 
 
-def _windowed(problem: _Problem, effort: Array, theta: Array, omega: Array, free: Sequence[int]) -> Array:
-    """Return the sensitivities as a fit sees them: windows of 1 s, the initial state of each projected out."""
-    recording = Recording(problem.time, theta, None, effort, hold="zero")
-    piece = prepare(recording, 1.0)
-    first = piece.windows[:, 0]
-    piece = replace(piece, states=np.stack((theta[first], omega[first]), axis=1))
-    result = simulate(from_plant(problem.plant), piece, free=free)
-    parts = [result.jacobian[first:stop] for first, stop in piece.windows]
-    return np.concatenate([without(part[:, -2:], part[:, :-2]) for part in parts])
+def _sensitivities(problem: _Problem, effort: Array, position: Array, velocity: Array, names: Sequence[str]) -> Array:
+    """Return those of the positions as a fit sees them, shape (samples, k): initial states of windows projected out."""
+    plant, count, found = problem.plant, position.shape[1], np.hstack((position, velocity))
+    if plant.is_pendulum:
+        piece, own = prepare(_recorded(problem, effort, position[:, 0]), 1.0), from_plant(plant)
+        seen = information([own], angle_motions(own, [piece], np.inf), [found[piece.windows[:, 0]]], names)
+    else:
+        # As long as those of a fit, which are a sixth of the data.
+        window = float(np.clip(problem.time[-1] / 6.0, 0.5, 5.0))
+        data, model = prepare_windows(_joint_recording(problem, effort, position), window), _joint_model(plant)
+        states = found[np.searchsorted(problem.time, data.time[:, 0] - 1e-9)]
+        seen = information([model], [WeightedErrors(data, np.repeat([1.0, 0.0], count))], [states], names)
+    return np.concatenate([part for part, _ in seen.windows])
+
+
+def _recorded(problem: _Problem, effort: Array, position: Array | None = None) -> Recording:
+    theta = np.zeros_like(problem.time) if position is None else position
+    return Recording(problem.time, theta, None, effort, hold="zero")
+
+
+def _joint_recording(problem: _Problem, effort: Array, position: Array) -> JointRecording:
+    efforts = np.zeros_like(position)
+    efforts[:, problem.joint] = effort
+    return JointRecording("the excitation", problem.time, position, efforts, ("zero",) * position.shape[1])
 
 
 def _joint_model(plant: PlantParameters) -> JointModel:
@@ -264,77 +301,27 @@ def _joint_model(plant: PlantParameters) -> JointModel:
     return JointModel.of(plant).with_changes({DELAY: common_delay(plant), LAG: lags[0]})
 
 
-def _joint_windows(problem: _Problem, effort: Array, position: Array, window: float) -> Windows:
-    efforts = np.zeros_like(position)
-    efforts[:, problem.joint] = effort
-    time = problem.time
-    recording = JointRecording("the excitation", time, position, efforts, ("zero",) * position.shape[1])
-    return prepare_windows(recording, window)
-
-
-def _joint_motion(problem: _Problem, effort: Array) -> tuple[Array, Array]:
-    """Return positions and velocities (n, joints) of several joints that hang at first."""
-    time, n = problem.time, len(problem.plant.joints)
-    # All of it is one window, which begins a little after the recording: both begin at rest.
-    lead = time[1] * np.arange(-_LEAD, 0)
-    whole = replace(problem, time=np.concatenate([lead, time]) - lead[0])
-    padded = np.concatenate([np.zeros(_LEAD), effort])
-    data = _joint_windows(whole, padded, np.zeros((whole.time.size, n)), float(whole.time[-1]) + 1.0)
-    at = np.zeros((1, 1, 2 * n))
-    model = _joint_model(problem.plant)
-    path = motions(model, model.vector[None], data, at)[0, 0][data.inside[0]]
-    first = path.shape[0] - time.size
-    return path[first:, :n], path[first:, n:]
-
-
-def _joint_windowed(problem: _Problem, effort: Array, position: Array, velocity: Array, names: Sequence[str]) -> Array:
-    """Return the sensitivities of the positions as a fit sees them, as :func:`_windowed` does."""
-    model, n = _joint_model(problem.plant), position.shape[1]
-    # As long as those of a fit, which are a sixth of the data.
-    data = _joint_windows(problem, effort, position, float(np.clip(problem.time[-1] / 6.0, 0.5, 5.0)))
-    first = np.searchsorted(problem.time, data.time[:, 0] - 1e-9)
-    states = np.concatenate([position[first], velocity[first]], axis=1)
-    path = motions(model, model.vector[None], data, states[None])[0]
-    slopes, k = sensitivity(model, names, data, states, path)[:, :, :n], len(names)
-    parts = [rows[inside].reshape(-1, k + 2 * n) for rows, inside in zip(slopes, data.inside, strict=True)]
-    return np.concatenate([without(part[:, k:], part[:, :k]) for part in parts])
-
-
 def _keeps(problem: _Problem, shape: Array) -> bool:
-    theta, omega = _motion(problem, problem.limits.effort * shape)
-    if theta.ndim == 1:
-        within = np.abs(theta) <= problem.limits.angle
-    else:
-        slides = np.array([joint.unit == "m" for joint in problem.plant.coordinates.joints])
-        # A slide coasts on when the effort has ended, while the recording does.
-        after = theta[-1:] + _COASTING * omega[-1:] * slides
-        within = np.abs(np.concatenate([theta, after])) <= problem.limits.of(problem.plant)
-    return bool(np.all(within) and np.max(np.abs(omega)) <= problem.limits.speed)
+    position, velocity = _motion(problem, problem.limits.effort * shape)
+    slides = np.array([joint.unit == "m" for joint in problem.plant.coordinates.joints])
+    # A slide coasts on when the effort has ended, while the recording does.
+    after = position[-1:] + _COASTING * velocity[-1:] * slides
+    within = np.abs(np.concatenate([position, after])) <= problem.limits.of(problem.plant)
+    return bool(np.all(within) and np.max(np.abs(velocity)) <= problem.limits.speed)
 
 
 def _judge(problem: _Problem, kind: str, shape: Array) -> Excitation:
-    effort, plant = problem.limits.effort * shape, problem.plant
-    theta, omega = _motion(problem, effort)
-    if plant.is_pendulum:
-        others = [n for n in _OF_ONE if n not in problem.parameters]
-        names = [*problem.parameters, *others, *(n for n in NUISANCE if n not in problem.parameters)]
-        jacobian = _windowed(problem, effort, theta, omega, [INDEX[name] for name in names])
-    else:
-        model = JointModel.of(plant)
-        offsets = [name for group in model.own_offsets for name in group]
-        names = [*dict.fromkeys((*problem.parameters, *model.fitted(), *offsets))]
-        jacobian = _joint_windowed(problem, effort, theta, omega, names)
+    effort, parameters = problem.limits.effort * shape, problem.parameters
+    position, velocity = _motion(problem, effort)
+    names = [*dict.fromkeys((*parameters, *problem.nuisance))]
+    jacobian = _sensitivities(problem, effort, position, velocity, names)
     scale = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
     singular = np.linalg.svd(jacobian / scale, full_matrices=False)
     inverse = (singular[2].T / np.maximum(singular[1], 1e-9) ** 2) @ singular[2]
     error = problem.noise * np.sqrt(np.diag(inverse)) / scale
-    predicted = {name: 1.96 * float(error[i]) for i, name in enumerate(problem.parameters)}
-    if plant.is_pendulum:
-        own = from_plant(plant)
-        # A parameter that is 0 in the prior has no relative error: take its share of gravity instead.
-        size = {n: abs(own[n]) or 0.05 * max(plant.gravity, 1e-3) for n in problem.parameters}
-    else:
-        size = {n: JointModel.of(plant).size(n) for n in problem.parameters}
-    relative = {name: predicted[name] / size[name] for name in problem.parameters}
+    predicted = {name: 1.96 * float(error[i]) for i, name in enumerate(parameters)}
+    relative = {name: predicted[name] / size for name, size in zip(parameters, problem.sizes, strict=True)}
     score = float(np.mean([np.log(max(value, 1e-12)) for value in relative.values()]))
-    return Excitation(kind, problem.time, effort, theta, omega, predicted, relative, score)
+    if position.shape[1] == 1:
+        position, velocity = position[:, 0], velocity[:, 0]
+    return Excitation(kind, problem.time, effort, position, velocity, predicted, relative, score)

@@ -31,6 +31,7 @@ __all__ = [
     "MOST",
     "JointFit",
     "Score",
+    "WeightedErrors",
     "Windows",
     "error_weights",
     "first_weights",
@@ -257,7 +258,7 @@ class JointFit(Solution[JointModel]):
     @cached_property
     def information(self) -> Information:
         """Sensitivities and errors by window, weighted."""
-        weighted = [_Motion(part, self.weights) for part in self.data]
+        weighted = [WeightedErrors(part, self.weights) for part in self.data]
         return information(self.models, weighted, self.states, self.free, self.own)
 
     @property
@@ -311,7 +312,7 @@ def _errors(part: Windows, path: Array) -> Array:
 
 
 @dataclass
-class _Motion:
+class WeightedErrors:
     """The weighted errors of one recording; sensitivities are differences from the motion simulated last."""
 
     part: Windows
@@ -327,9 +328,11 @@ class _Motion:
         return last[2]
 
     def errors(self, model: JointModel, states: Array) -> Array:
+        """Return all errors, of positions before velocities at each sample."""
         return np.ravel(_errors(self.part, self._path(model, states)) * self.weights)
 
     def sensitivities(self, model: JointModel, states: Array, names: Sequence[str]) -> tuple[Array, Array, list[int]]:
+        """Return sensitivities, errors and ends of windows; see :class:`~arrowhead.Motion`."""
         path, part = self._path(model, states), self.part
         own = self.weights * np.repeat([1.0, float(part.velocity is not None)], part.position.shape[-1])
         scaled = sensitivity(model, names, part, states, path) * (part.inside[..., None] * own)[..., None]
@@ -365,7 +368,7 @@ def fit(
     weights = np.concatenate((weights, np.zeros(count))) if weights.size == count else weights
     found = minimise(
         model,
-        [_Motion(part, weights) for part in data],
+        [WeightedErrors(part, weights) for part in data],
         states or [part.states for part in data],
         free,
         own=own,
