@@ -219,10 +219,10 @@ def test_an_experiment_for_one_joint_names_what_does_it_for_several(
 def test_the_main_experiment_of_a_plant_of_several_joints_is_that_of_joints(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    from pendulum_bags.commands import experiment_cli, joints_cli
+    from pendulum_bags.commands import experiment_cli, thesis_cli
 
     ordered: list[Order] = []
-    monkeypatch.setattr(joints_cli, "run_whole", lambda out, name, order_in, **_: ordered.append(order_in(out)))
+    monkeypatch.setattr(thesis_cli, "run_whole", lambda out, name, order_in, **_: ordered.append(order_in(out)))
     words = ["--plant", "acrobot", "--seed", "4", "--duration", "3", "--budget", "5", "--controller", "lqi"]
     assert experiment_cli.main(["thesis", *words, "--contenders", "4", "--out", str(tmp_path)]) == 0
     (order,) = ordered
@@ -236,6 +236,10 @@ def test_the_main_experiment_of_a_plant_of_several_joints_is_that_of_joints(
     for option, value in (("--strategy", "effort_loop"), ("--ramp-speed", "0.3")):
         assert experiment_cli.main(["thesis", "--plant", "acrobot", option, value]) == 2
         assert f"error: {option} is for a plant of one joint, and acrobot has several" in capsys.readouterr().err
+    assert experiment_cli.main(["joints", "--plant", "thesis", "--share", "0.1"]) == 2
+    assert "error: --share is for a plant of several joints, and thesis has one" in capsys.readouterr().err
+    assert experiment_cli.main(["joints", "--out", str(tmp_path)]) == 0
+    assert ordered.pop().settings.plant == "cart_pole"
     assert len(ordered) == 1
 
 
