@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import json
-import os
 import re
 import shlex
 import subprocess
@@ -25,6 +24,9 @@ from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_testing.fixtures import PROJECT
 from pendulum_testing.processes import ProcessGroup, RunningProgram
+from tests.acceptance.test_readme import RunLine, run_line
+
+__all__ = ["run_line"]
 
 PAGES = sorted(
     PROJECT / name
@@ -59,20 +61,15 @@ def test_links_of_a_page_lead_somewhere(page: Path) -> None:
 
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("page", CHAINS, ids=lambda page: str(page.relative_to(PROJECT)))
-def test_commands_that_build_on_each_other_run(page: Path, domain_id: int, tmp_path: Path) -> None:
-    environment = {**os.environ, "PATH": f"{PROJECT / '.venv' / 'bin'}:{os.environ['PATH']}"}
+def test_commands_that_build_on_each_other_run(page: Path, run_line: RunLine, domain_id: int, tmp_path: Path) -> None:
     for line in CHAINS[page]:
-        if line == JOINTS:
-            continue
-        done = subprocess.run(
-            line, shell=True, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=500, check=False
-        )
-        assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+        if line != JOINTS:
+            run_line(line, tmp_path)
 
 
 @pytest.mark.parametrize("page", TOGETHER, ids=lambda page: str(page.relative_to(PROJECT)))
 def test_programs_that_a_page_starts_together_leave_what_it_looks_at_then(
-    page: Path, processes: ProcessGroup, domain_id: int, tmp_path: Path
+    page: Path, processes: ProcessGroup, run_line: RunLine, domain_id: int, tmp_path: Path
 ) -> None:
     """The last of them is a disturbance with a duration; the recorder is ended first."""
     together, then = _TOGETHER.findall(page.read_text(encoding="utf-8"))[0]
@@ -88,9 +85,7 @@ def test_programs_that_a_page_starts_together_leave_what_it_looks_at_then(
         program.interrupt()
         assert program.wait(60) == 0, program.output
     for line in then.splitlines():
-        words = shlex.split(line.removeprefix("$ "))
-        done = subprocess.run([sys.executable, *words[1:]], cwd=tmp_path, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
+        run_line(line.removeprefix("$ "), tmp_path)
 
 
 def _dead_links(page: Path) -> list[str]:

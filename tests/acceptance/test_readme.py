@@ -9,11 +9,14 @@ import os
 import re
 import shlex
 import subprocess
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from pendulum_bags.experiments.host_pool import HostPool, share_pool
 from pendulum_hw_bridge.checks.check_cli import EXIT_BUSY
+from pendulum_msgs_py.programs.executables import run_package
 from pendulum_testing.fixtures import PROJECT
 from pendulum_testing.processes import ProcessGroup
 
@@ -43,11 +46,39 @@ def _commands() -> list[tuple[str, str]]:
 
 
 COMMANDS = _commands()
+RunLine = Callable[..., str]
+OF_ONE_PROCESS = {"pendulum_sim", "pendulum_lqr", "pendulum_bags", "pendulum_course"}
+"""Packages whose commands run in the process of the tests; those of the bridge measure or change their own."""
 FROM_STAIRS = next(command for _, command in COMMANDS if " experiment gravity " in command)
 """From an unknown pendulum to a controller designed for it."""
 TESTED_ELSEWHERE = {
     FROM_STAIRS: "tests/integration/test_experiments.py",
 }
+
+
+@pytest.fixture
+def run_line(hosts: HostPool, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Iterator[RunLine]:
+    """Return what runs a command of a page, in a folder, and returns what it printed; it must succeed.
+
+    Our programs run in this process, which has imported them already, and share its hosts; a shell runs the rest.
+    """
+
+    def run(line: str, folder: Path, *codes: int) -> str:
+        words = shlex.split(line)
+        with monkeypatch.context() as patch:
+            patch.chdir(folder)
+            patch.setenv("PATH", f"{PROJECT / '.venv' / 'bin'}:{os.environ['PATH']}")
+            capfd.readouterr()
+            if words[:2] == ["python", "-m"] and not {"&&", ">"} & set(words) and words[2] in OF_ONE_PROCESS:
+                code = run_package(words[2], words[3:])
+            else:
+                code = subprocess.run(line, shell=True, timeout=500, check=False).returncode
+            output = "".join(capfd.readouterr())
+        assert code in {0, *codes}, f"{line}\n{output}"
+        return output
+
+    with share_pool(hosts):
+        yield run
 
 
 @pytest.fixture
@@ -79,27 +110,28 @@ def test_the_first_page_runs_in_a_fresh_shell_as_it_is_printed(root: Path) -> No
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(("page", "command"), COMMANDS, ids=[f"{page}: {command}" for page, command in COMMANDS])
 def test_command_of_a_page_runs(
-    processes: ProcessGroup, domain_id: int, tmp_path: Path, root: Path, page: str, command: str
+    processes: ProcessGroup,
+    run_line: RunLine,
+    domain_id: int,
+    tmp_path: Path,
+    root: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    page: str,
+    command: str,
 ) -> None:
     if command in TESTED_ELSEWHERE:
         pytest.skip(f"run by {TESTED_ELSEWHERE[command]}")
     if "../shared/" in command and not (PROJECT.parent / "shared").is_dir():
         pytest.skip("the recordings of real pendulums are not at hand")
     words = shlex.split(command)
-    environment = {**os.environ, "PATH": f"{PROJECT / '.venv' / 'bin'}:{os.environ['PATH']}"}
     if words[0] == "python" and words[1] == "-m" and words[3] in NODES:
         program = processes.start(words[2], words[3], *words[4:], cwd=tmp_path)
         program.wait_for_output(r"\[INFO\]|recording to", 200)
         program.interrupt()
         assert program.wait(60) == 0, program.output
         return
-    environment |= {"NO_COLOR": "1", "FORCE_COLOR": "1"}
-    done = subprocess.run(
-        command, shell=True, cwd=root, env=environment, capture_output=True, text=True, timeout=500, check=False
-    )
-    assert not _COLOUR.search(done.stdout + done.stderr), f"{page}: {command}\n{done.stdout!r}\n{done.stderr!r}"
+    monkeypatch.setenv("NO_COLOR", "1")
+    monkeypatch.setenv("FORCE_COLOR", "1")
     # Other tests run beside this one, and the checklist is right to say so.
-    if words[3:4] == ["check"] and done.returncode == EXIT_BUSY:
-        assert "This computer is too busy to tell" in done.stdout
-        return
-    assert done.returncode == 0, f"{page}: {command}\n{done.stdout}\n{done.stderr}"
+    output = run_line(command, root, *([EXIT_BUSY] if words[3:4] == ["check"] else []))
+    assert not _COLOUR.search(output), f"{page}: {command}\n{output!r}"
