@@ -148,26 +148,32 @@ def test_indices_of_what_does_not_vary_are_null_for_readers_of_json(
 
 
 @arrow
-@pytest.mark.parametrize(
-    "study",
-    [
+def test_studies_on_a_simulated_gpu_have_the_numbers_of_the_processor(tmp_path: Path) -> None:
+    studies = (
         ("monte_carlo", "--runs", "5", "--hold-time", "0.01", "--sobol", "0"),
         ("region_of_attraction", "--plants", "1", "--points", "3"),
-    ],
-)
-def test_a_study_on_a_simulated_gpu_has_the_numbers_of_the_processor(tmp_path: Path, study: tuple[str, ...]) -> None:
-    tables = []
-    for device, simulator in (("cpu", "0"), ("auto", "1")):
-        out = tmp_path / device
-        options = ["--duration", "0.02", "--device", device, "--out", str(out)]
-        command = [sys.executable, "-m", "pendulum_bags", "experiment", *study, *options]
-        subprocess.run(command, env={**os.environ, "NUMBA_ENABLE_CUDASIM": simulator}, check=True, capture_output=True)
-        tables.append(read_columns(chunk_path(out, 0), ("theta_end", "theta_dot_end")))
-    settings = json.loads((tmp_path / "auto" / "settings.json").read_text())["settings"]
-    assert settings["device"] == "cuda"
-    for name, values in tables[0].items():
-        np.testing.assert_allclose(values, tables[1][name], rtol=0.0, atol=1e-12)
-        assert np.ptp(values) > 0.0
+    )
+    commands = {
+        device: [
+            [*study, "--duration", "0.02", "--device", device, "--out", str(tmp_path / device / study[0])]
+            for study in studies
+        ]
+        for device in ("cpu", "auto")
+    }
+    assert [main(command) for command in commands["cpu"]] == [0, 0]
+    script = "import json, sys\nfrom pendulum_bags.commands.experiment_cli import main\n"
+    script += "raise SystemExit(max(main(command) for command in json.loads(sys.argv[1])))"
+    there = [sys.executable, "-c", script, json.dumps(commands["auto"])]
+    subprocess.run(there, env={**os.environ, "NUMBA_ENABLE_CUDASIM": "1"}, check=True, capture_output=True)
+    for name, *_ in studies:
+        settings = json.loads((tmp_path / "auto" / name / "settings.json").read_text())["settings"]
+        assert settings["device"] == "cuda"
+        here, gpu = (
+            read_columns(chunk_path(tmp_path / device / name, 0), ("theta_end", "theta_dot_end")) for device in commands
+        )
+        for column, values in here.items():
+            np.testing.assert_allclose(values, gpu[column], rtol=0.0, atol=1e-12)
+            assert np.ptp(values) > 0.0
 
 
 def test_without_a_gpu_the_program_says_so_in_one_sentence(tmp_path: Path) -> None:
