@@ -150,10 +150,10 @@ def _start_mujoco(processes: ProcessGroup, folder: Path) -> RunningProgram:
     return processes.start("pendulum_sim", "mujoco", *_AS_TINY_PLANT, "-p", f"model:={model}", "-p", "rate_hz:=100.0")
 
 
-def _start_simulator(processes: ProcessGroup, compiled: bool) -> RunningProgram:
-    """Start a pendulum under the tiny plant's name and limit, its periods compiled or not."""
+def _start_simulator(processes: ProcessGroup) -> RunningProgram:
+    """Start a pendulum under the tiny plant's name and limit, its periods compiled."""
     # Python takes longer periods itself.
-    settings = ("-p", "rate_hz:=200.0", "-p", "effort_limit:=5.0", "-p", f"compiled:={str(compiled).lower()}")
+    settings = ("-p", "rate_hz:=200.0", "-p", "effort_limit:=5.0")
     return processes.start("pendulum_sim", "simulator", *_AS_TINY_PLANT, *settings)
 
 
@@ -181,7 +181,7 @@ def plant(processes: ProcessGroup, peer: Peer) -> RunningProgram:
 
 
 # The tiny one at last: the tests that follow have it run beside them.
-@pytest.fixture(scope="module", params=["interpreted", "compiled", "mujoco", "tiny_plant"])
+@pytest.fixture(scope="module", params=["compiled", "mujoco", "tiny_plant"])
 def running_plant(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Peer]:
     """Start a plant for all the tests that leave it as sound as they found it, and who speaks to it."""
     if request.param == "mujoco":
@@ -196,15 +196,14 @@ def running_plant(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempP
             elif request.param == "mujoco":
                 program = _start_mujoco(processes, folder)
             else:
-                program = _start_simulator(processes, request.param == "compiled")
+                program = _start_simulator(processes)
             peer.program = _await(peer, program)
             # As a plant starts: whoever uses it first finds this, too.
             assert peer.diagnostics["mode"] == "disarmed"
             yield peer
-            if request.param in {"compiled", "interpreted"}:
-                assert peer.diagnostics["loop"].startswith(request.param)
-                assert ("periods_compiled" in peer.diagnostics) == (request.param == "compiled")
+            assert ("periods_compiled" in peer.diagnostics) == (request.param == "compiled")
             if request.param == "compiled":
+                assert peer.diagnostics["loop"].startswith("compiled")
                 peer.until(lambda: int(peer.diagnostics["periods_compiled"]) > 100, "compiled periods")
         finally:
             peer.close()

@@ -114,18 +114,17 @@ def test_an_acrobot_is_held_upright_under_noise_in_lockstep_and_its_bag_is_read_
     assert states.effort[:, 1].any()
 
 
-@pytest.mark.parametrize("name", ["tvlqr", "ilqr"])
-def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: JointsPeer, processes, name: str) -> None:
+def test_an_acrobot_swings_up_in_lockstep_and_stays(peer: JointsPeer, processes) -> None:
     controller = _start(
         processes,
         "pendulum_lqr",
         "controller",
         "plant:=acrobot_frictionless",
-        f"controller:={name}",
+        "controller:=tvlqr",
         "period:=0.004",
         "use_sim_time:=true",
     )
-    controller.wait_for_output(rf"{name} for plant acrobot_frictionless: swing-up of .*sampled from", 240)
+    controller.wait_for_output(r"tvlqr for plant acrobot_frictionless: swing-up of .*sampled from", 240)
     _start_lockstep(processes, "acrobot_frictionless", 5.0, "rate_hz:=250.0")
     # The event may come before the states that wait here.
     peer.until(lambda: peer.states and peer.states[-1].header.stamp.sec == 6, "the last state, after 5 s", 200.0)
