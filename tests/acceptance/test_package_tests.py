@@ -41,14 +41,48 @@ def _run(*command: str | Path, cwd: Path, timeout: float = 280.0) -> subprocess.
     )
 
 
+_COLLECT = """
+import contextlib, importlib, os, sys
+import pytest
+
+for name in sys.argv[1].split():
+    with contextlib.suppress(ImportError):
+        importlib.import_module(name)
+for folder in sys.argv[2:]:
+    if (child := os.fork()) == 0:
+        os.chdir(folder)
+        sys.path[0] = folder
+        with open(folder + ".txt", "w") as out:
+            os.dup2(out.fileno(), 1)
+            os.dup2(out.fileno(), 2)
+            # To rewrite the assertions of what is only collected takes longer than all the rest.
+            code = pytest.main(["--collect-only", "-q", "--assert=plain", "-p", "no:cacheprovider"])
+            sys.stdout.flush()
+        os._exit(code)
+    if os.waitpid(child, 0)[1]:
+        raise SystemExit(open(folder + ".txt").read()[-3000:])
+"""
+"""Collects the tests of each folder in a process of its own; the libraries of others, half of the time, load once."""
+_LIBRARIES = (
+    "numpy scipy.optimize scipy.signal scipy.stats scipy.integrate hypothesis matplotlib.pyplot rclpy.node numba"
+)
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Collect the tests of each package where it lies alone; return the folder of all, and of what each printed."""
+    base = tmp_path_factory.mktemp("alone")
+    folders = [_alone(package, base / package) for package in FOLDERS]
+    done = _run(sys.executable, "-c", _COLLECT, _LIBRARIES, *folders, cwd=base)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return base
+
+
 @pytest.mark.parametrize("package", FOLDERS)
-def test_a_package_that_lies_alone_collects_all_of_its_tests(package: str, tmp_path: Path) -> None:
-    folder = _alone(package, tmp_path)
-    # To rewrite the assertions of what is only collected takes longer than all the rest.
-    once = ("--collect-only", "-q", "--assert=plain", "-p", "no:cacheprovider")
-    done = _run(sys.executable, "-m", "pytest", *once, cwd=folder)
-    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    found = {line.partition("::")[0] for line in done.stdout.splitlines() if "::" in line}
+def test_a_package_that_lies_alone_collects_all_of_its_tests(package: str, collected: Path) -> None:
+    folder = collected / package / package
+    lines = folder.with_suffix(".txt").read_text(encoding="utf-8").splitlines()
+    found = {line.partition("::")[0] for line in lines if "::" in line}
     assert found == {f"test/{file.name}" for file in (folder / "test").glob("test_*.py")}
 
 

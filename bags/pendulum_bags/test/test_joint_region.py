@@ -97,8 +97,8 @@ def test_what_is_no_map_is_refused(change: dict[str, object], words: str) -> Non
 def test_the_command_maps_draws_and_refuses_options_of_the_other_kind(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    own = ["region_of_attraction", "--plant", "furuta", "--plants", "2", "--points", "5", "--duration", "1"]
-    own += ["--axes", "pendulum,pendulum_dot", "--spans", "0.3", "3", "--out", str(tmp_path / "map")]
+    own = ["region_of_attraction", "--plant", "cart_pole", "--plants", "2", "--points", "5", "--duration", "1"]
+    own += ["--axes", "pole,pole_dot", "--spans", "0.3", "3", "--out", str(tmp_path / "map")]
     assert main([*own, "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
     assert [axis["unit"] for axis in content["axes"]] == ["rad", "rad/s"]
@@ -106,6 +106,6 @@ def test_the_command_maps_draws_and_refuses_options_of_the_other_kind(
     assert (tmp_path / "map" / "region.png").stat().st_size > 10_000
     for option in (["--q", "1", "2"], ["--effort-limit", "1"], ["--angle-span", "1"]):
         assert main([*own, *option]) == 2
-        assert f"error: {option[0]} is for a plant of one joint, and furuta has several" in capsys.readouterr().err
+        assert f"error: {option[0]} is for a plant of one joint, and cart_pole has several" in capsys.readouterr().err
     assert main(["region_of_attraction", "--axes", "cart,pole"]) == 2
     assert "error: --axes is for a plant of several joints, and thesis has one" in capsys.readouterr().err
