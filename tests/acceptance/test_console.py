@@ -186,13 +186,10 @@ def browser(bench: Bench, chromium: Any) -> Iterator[Any]:
         context.close()
 
 
-def _open(
-    browser: Any, address: str, width: int = 1280, height: int = 860, *, slow_display: bool = True, **options: Any
-) -> Any:
+def _open(browser: Any, address: str, width: int = 1280, height: int = 860, **options: Any) -> Any:
     page = browser.new_page(viewport={"width": width, "height": height}, **options)
     page.set_default_timeout(60_000)
-    if slow_display:
-        page.add_init_script(SLOW_DISPLAY)
+    page.add_init_script(SLOW_DISPLAY)
     page.goto(address)
     page.wait_for_selector("[data-plant='/sim'] .armed_effort")
     return page
@@ -210,7 +207,7 @@ def _mode(page: Any) -> str:
 
 
 def test_two_clients_see_stop_tune_and_meet_a_new_simulator(browser: Any, bench: Bench) -> None:
-    desk, phone = _open(browser, bench.address, slow_display=False), _open(browser, bench.address, 390, 844)
+    desk, phone = _open(browser, bench.address), _open(browser, bench.address, 390, 844)
 
     # Phone: nothing hangs over the edge, and the stop is in reach.
     assert phone.evaluate("document.documentElement.scrollWidth") <= 390
@@ -326,9 +323,7 @@ def test_joints_and_controllers_are_chosen_for_each_plant(browser: Any, bench: B
     acrobot = ["-p", "plant:=acrobot", "-p", "rate_hz:=100.0"]
     of_sim = page.get_by_role("button", name="Start controller /sim")
     place = of_sim.evaluate(PLACE_AMONG_PLANTS)
-    other = bench.processes.start(
-        "pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", "-p", "plant:=acrobot"
-    )
+    other = bench.processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/robot", *acrobot)
     joints = page.get_by_label("Lines of /robot: joint")
     joints.wait_for()
     assert joints.locator("option").all_inner_texts() == ["shoulder", "elbow"]

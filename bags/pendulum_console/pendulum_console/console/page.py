@@ -26,6 +26,8 @@ from pendulum_console.console.security import Guard
 __all__ = ["serve"]
 
 FRAME_PERIOD = 1.0 / 60.0
+_RECONNECT_TIMEOUT = 15.0
+"""Time for which the server remembers a page that has lost its connection [s]."""
 _STATIC = Path(__file__).parent / "static"
 
 
@@ -81,7 +83,8 @@ def serve(
     def page() -> None:
         Layout(graph, jobs).build()
 
-    ui.run_with(app, dark=None, show_welcome_message=False)
+    # A page that a busy computer keeps waiting for longer is loaded anew, and what is pressed meanwhile is lost.
+    ui.run_with(app, dark=None, show_welcome_message=False, reconnect_timeout=_RECONNECT_TIMEOUT)
     # Quasar's request bar has no name for a screen reader, and adds nothing to the page.
     pages.config.quasar_config["loadingBar"]["skipHijack"] = True
     uvicorn.run(
