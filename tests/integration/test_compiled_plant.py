@@ -142,7 +142,7 @@ def _run(folder: Path, *, compiled: bool, **parameters: Any) -> tuple[list[bytes
 
 @pytest.mark.parametrize(
     "parameters",
-    [{}, {"plant": "dfki"}, {"method": "rk4", "substeps": 3, "effort_slew_limit": 200.0, "velocity_limit": 100.0}],
+    [{}, {"plant": "dfki"}, {"method": "euler", "substeps": 3, "effort_slew_limit": 200.0, "velocity_limit": 100.0}],
     ids=["thesis", "dry friction", "substeps, slew"],
 )
 def test_a_run_is_the_same_compiled_and_interpreted(tmp_path: Path, parameters: dict[str, Any]) -> None:

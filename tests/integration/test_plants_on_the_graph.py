@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
 from collections.abc import Iterator
@@ -11,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pendulum_bags.commands.experiment_cli import main
 from pendulum_bags.experiments.graph_plant import join
 from pendulum_bags.experiments.orchestrator_node import Orchestrator
 from pendulum_msgs_py.errors import FaultError
@@ -98,26 +100,28 @@ def test_an_adopted_cart_pole_that_a_hand_holds_is_balanced_and_compared_with_a_
 
 
 def test_a_plant_that_is_armed_or_commanded_or_not_there_is_left_alone(
-    processes: ProcessGroup, domain_id: int, peer: PlantPeer, tmp_path: Path
+    processes: ProcessGroup,
+    domain_id: int,
+    peer: PlantPeer,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("sys.stdin", io.StringIO())
     processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/lab", "-p", "armed_at_start:=false")
     peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "the plant")
     out = tmp_path / "run"
-    lab = ("--hardware", "ros:/lab")
 
-    unasked = experiment(processes, domain_id, out, *lab)
-    assert unasked.wait(60.0) == 2
-    assert "there is no terminal to confirm in; expected one, or --yes; nothing was started" in unasked.output
+    def refusal(*more: str) -> str:
+        words = ["thesis", "--out", str(out), "--domain", str(domain_id), "--hardware", "ros:/lab", *more]
+        assert main(words) == 2
+        return " ".join(capfd.readouterr().err.split())
 
-    commanded = experiment(processes, domain_id, out, *lab, "--yes")
-    assert commanded.wait(60.0) == 2
-    assert "/lab/effort_command has 1 publisher: another program commands this plant" in commanded.output
-
+    assert "there is no terminal to confirm in; expected one, or --yes; nothing was started" in refusal()
+    assert "/lab/effort_command has 1 publisher: another program commands this plant" in refusal("--yes")
     peer.leave_the_command()
     assert peer.arm().success
-    armed = experiment(processes, domain_id, out, *lab, "--yes")
-    assert armed.wait(60.0) == 2
-    assert "/lab is armed already; expected it at rest" in armed.output
+    assert "/lab is armed already; expected it at rest" in refusal("--yes")
     peer.spin(0.2)
     # Whoever armed it has it still: a refusal disarms nobody's plant.
     assert peer.diagnostics["mode"].startswith("armed")
