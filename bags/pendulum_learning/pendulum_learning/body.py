@@ -37,7 +37,7 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters, common_del
 from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 from pendulum_sim.batches.compiling import WITHIN, compile_by_type, compile_tree, tuple_loader
 from pendulum_sim.stepping.dry_friction import LAG as LAG_OF_ONE
-from pendulum_sim.stepping.dry_friction import PACKED, acceleration_with_friction, advance_dry
+from pendulum_sim.stepping.dry_friction import PACKED, advance_dry, link_acceleration_of
 from pendulum_sim.stepping.integrators import get_integrator
 from pendulum_sim.stepping.plant import pack
 
@@ -203,7 +203,7 @@ def _pendulum(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]])
         ratios=_ratio(coulomb + 1, coulomb, plant.static_friction, plant.coulomb_friction),
         offsets=(columns["torque_offset"],),
         longest=longest,
-        advance=_pendulum_kernel(),
+        advance=_pendulum_kernel(plant.has_torques),
         privileged=privileged,
         height=lambda x: np.cos(x[:, 0]),
         excess=None,
@@ -228,8 +228,8 @@ def _mechanism(plant: PlantParameters, ranges: Mapping[str, tuple[float, float]]
         if not joint.turns:
             table[LOWER][i], table[UPPER][i] = joint.goal - reach, joint.goal + reach
     row = np.array([*plant.packed, *(value for each in table for value in each), *([0.0] * n)])
-    names = (*mechanism.parameter_names[: width - n], *(f"{joint.name}.damping" for joint in mechanism.joints))
-    columns = {name: k for k, name in enumerate(names)}
+    columns = {name: k for k, name in enumerate(mechanism.parameter_names)}
+    columns |= {f"{joint.name}.damping": len(plant.values) + i for i, joint in enumerate(mechanism.joints)}
     for kind in (COULOMB, STATIC):
         for i, joint in enumerate(mechanism.joints):
             columns[f"{joint.name}.{JOINT_ROWS[kind]}"] = width + kind * n + i
@@ -293,11 +293,12 @@ def _decay(plant: PlantParameters) -> float:
 
 
 @cache
-def _pendulum_kernel() -> Any:
+def _pendulum_kernel(torques: bool) -> Any:
     integrator = get_integrator("rk4")
     step = compile_tree(integrator.step, inline=True)
     coefficients_of = compile_tree(integrator.coefficients, inline=True)
-    acceleration = compile_tree(acceleration_with_friction, inline=True)
+    equation = link_acceleration_of(torques)
+    acceleration = compile_tree(equation, inline=True)
     advance = compile_tree(advance_dry, inline=True)
     lagged = compile_tree(actuator_torque, inline=True)
     load_plant = tuple_loader(len(PACKED), 1)
@@ -315,7 +316,7 @@ def _pendulum_kernel() -> Any:
         )
         return (theta,), (speed,), (lagged(torque[0], command[0], h, plant[LAG_OF_ONE]),)
 
-    made_of = (acceleration_with_friction, advance_dry, integrator.step, integrator.coefficients)
+    made_of = (equation, advance_dry, integrator.step, integrator.coefficients)
     return keep_kernel(_kernel((math.pi,), prepare, forward), "training_pendulum", *made_of)
 
 

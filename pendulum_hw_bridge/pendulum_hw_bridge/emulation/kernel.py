@@ -13,10 +13,12 @@ from typing import Any
 
 import numpy as np
 
+import pendulum_msgs_py.dynamics.joint_torques as _torques
 import pendulum_msgs_py.dynamics.rigid as _rigid
 import pendulum_msgs_py.dynamics.series_elastic as _sea
 from pendulum_hw_bridge.emulation import thermal as _thermal
 from pendulum_hw_bridge.emulation.firmware import CONTROL_PERIOD, Array, control_pwm
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES
 from pendulum_msgs_py.loops.machine_code import Loop, NoMachineCodeError, load_loop
 from pendulum_msgs_py.loops.records import structure_of
 from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, added_friction
@@ -43,7 +45,7 @@ CONSTANTS = (
     "link_damping", "gravity", "link_coulomb", "link_static", "link_stribeck", "winding_housing", "housing_body",
     "body_ambient", "winding_capacity", "housing_capacity", "body_capacity", "ambient", "max_winding",
     "critical_winding", "effort_normaliser", "velocity_normaliser", "velocity_clamp", "effort_clamp", "position_min",
-    "position_max", "pwm_limit", "pwm_step", "enabled", *TERM_PARAMETERS,
+    "position_max", "pwm_limit", "pwm_step", "enabled", *TERM_PARAMETERS, *JOINT_TORQUES,
 )  # fmt: skip
 """Entries of the constant vector."""
 
@@ -52,7 +54,8 @@ _QM, _VM, _Q, _V, _Z, _TW, _TH, _TB, _PWM, _I, _TAU, _HEAT = range(12)
     _N, _KT, _KE, _R20, _ALPHA, _BETA, _VOLT, _J, _BV, _TC, _TS, _VS, _K, _K3, _TAUH, _D0, _M, _BL, _G, _LTC, _LTS,
     _LVS, _RWH, _RHB, _RBA, _CW, _CH, _CB, _AMBIENT, _TMAX, _TCRIT, _FF_EFFORT, _FF_VELOCITY, _VCLAMP, _ECLAMP, _QMIN,
     _QMAX, _ULIMIT, _USTEP, _ENABLED,
-) = range(len(CONSTANTS) - len(TERM_PARAMETERS))  # fmt: skip
+) = range(len(CONSTANTS) - len(TERM_PARAMETERS) - len(JOINT_TORQUES))  # fmt: skip
+_DRAG, _COS_2, _SIN_2, _COS_3, _SIN_3 = range(len(CONSTANTS) - len(JOINT_TORQUES), len(CONSTANTS))
 
 _CLAMP_BAND = 0.05
 """Share of the velocity clamp over which the firmware reduces the duty to zero [-]."""
@@ -67,6 +70,7 @@ _dry_friction_step = _sea.dry_friction_step
 _link_acceleration = _sea.link_acceleration
 _gravity_torque = _rigid.gravity_torque
 _friction_magnitude = _rigid.friction_magnitude
+_joint_torque = _torques.joint_torque
 _added_friction = added_friction(CONSTANTS)
 _constant_at = _thermal.torque_constant_at
 
@@ -218,8 +222,13 @@ def advance(
         )
         friction = _friction_magnitude(state[_VM], constants[_TC], constants[_TS], constants[_VS])
         motor_velocity = _dry_friction_step(motor_velocity, friction, constants[_J], STEP)
+        own = 0.0
+        drag, cos_2, sin_2 = constants[_DRAG], constants[_COS_2], constants[_SIN_2]
+        cos_3, sin_3 = constants[_COS_3], constants[_SIN_3]
+        if drag != 0.0 or cos_2 != 0.0 or sin_2 != 0.0 or cos_3 != 0.0 or sin_3 != 0.0:
+            own = _joint_torque(state[_Q], state[_V], drag, cos_2, sin_2, cos_3, sin_3)
         velocity = state[_V] + STEP * _link_acceleration(
-            state[_Q], state[_V], spring, link_torque, constants[_M], constants[_BL], constants[_G]
+            state[_Q], state[_V], spring, link_torque + own, constants[_M], constants[_BL], constants[_G]
         )
         added = _added_friction(abs(state[_V]), abs(_gravity_torque(state[_Q], constants[_G])), constants)
         friction = _friction_magnitude(state[_V], constants[_LTC] + added, constants[_LTS] + added, constants[_LVS])

@@ -272,10 +272,10 @@ class EmulatedMachine:
         packed, off = self._behind.packed, [index for index, drive in enumerate(self.drives) if not drive.on]
         if not (off and self.coordinates.volts):
             return packed
-        damping = list(packed[len(self.plant.values) :])
+        p, first = list(packed), len(self.plant.values)
         for joint in (self.coordinates.driven[index] for index in off):
-            damping[joint] = self.plant.joints[joint].damping
-        return (*self.plant.values, *damping)
+            p[first + joint] = self.plant.joints[joint].damping
+        return tuple(p)
 
     def _end(self, index: int) -> None:
         """End a drive's torque, including delayed ones."""

@@ -15,6 +15,7 @@ from pendulum_hw_bridge.emulation.firmware import Array
 from pendulum_hw_bridge.emulation.kernel import CONSTANTS
 from pendulum_hw_bridge.emulation.thermal import ThermalParameters, torque_constant_at
 from pendulum_hw_bridge.port.actuator import HardwareLimits
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES
 from pendulum_msgs_py.dynamics.series_elastic import shorted_winding_damping, winding_resistance_at
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, terms_of
@@ -173,6 +174,7 @@ class EmulatorParameters:
             "pwm_step": self.sensors.pwm_step,
             "enabled": 1.0 if enabled else 0.0,
             **dict(zip(TERM_PARAMETERS, terms_of(self.plant), strict=True)),
+            **dict(zip(JOINT_TORQUES, self.plant.joints[0].torques, strict=True)),
         }
         return np.array([values[name] for name in CONSTANTS])
 

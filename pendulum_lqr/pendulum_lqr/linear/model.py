@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.joints import Vector
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
+from pendulum_msgs_py.dynamics.joint_torques import joint_torque, periodic_torque
 from pendulum_msgs_py.dynamics.rigid import rigid_acceleration
 from pendulum_msgs_py.dynamics.series_elastic import (
     link_acceleration,
@@ -42,6 +43,7 @@ from pendulum_msgs_py.plants.equilibrium import (
     held_torque,
     offset_of,
     resistance_of,
+    torques_of,
 )
 from pendulum_msgs_py.plants.joint_parameters import SeriesElasticParameters
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
@@ -264,6 +266,7 @@ def state_derivative(plant: RigidPlant, theta: Any, theta_dot: Any, effort: Any)
     torque = effort + offset_of(plant, "torque_offset")
     angle = theta - offset_of(plant, "angle_offset")
     equation = in_arithmetic(rigid_acceleration, np)
+    torque = torque + in_arithmetic(joint_torque, np)(angle, theta_dot, *torques_of(plant))
     return theta_dot, equation(angle, theta_dot, torque, plant.inertia, plant.damping, plant.gravity)
 
 
@@ -288,6 +291,11 @@ def acceleration_from_upright(
     torque = effort + plant.torque_offset
     if sign_velocity > 0.0 and plant.coulomb_friction > 0.0:
         torque = torque - plant.coulomb_friction * arithmetic.tanh(velocity / sign_velocity)
+    if plant.has_torques:
+        periodic = in_arithmetic(periodic_torque, arithmetic)
+        torque = torque + periodic(angle - plant.angle_offset + UPRIGHT, *torques_of(plant)[1:])
+        # A solver differentiates: the root of a square has no slope at rest.
+        torque = torque - plant.quadratic_drag * velocity * arithmetic.fabs(velocity)
     equation = rigid_acceleration if arithmetic is math else in_arithmetic(rigid_acceleration, arithmetic)
     # sin(theta) = -sin(theta - pi), exactly 0 at upright in this form.
     return equation(angle - plant.angle_offset, velocity, torque, plant.inertia, plant.damping, -plant.gravity)
@@ -295,8 +303,9 @@ def acceleration_from_upright(
 
 def _rigid_flow(plant: RigidPlant, x: tuple[complex, ...], torque: complex, push: complex) -> tuple[complex, ...]:
     acceleration = in_arithmetic(rigid_acceleration, cmath)
-    net = torque + push + offset_of(plant, "torque_offset")
     angle = x[0] - offset_of(plant, "angle_offset")
+    own = in_arithmetic(joint_torque, cmath)(angle, x[1], *torques_of(plant))
+    net = torque + push + offset_of(plant, "torque_offset") + own
     return x[1], acceleration(angle, x[1], net, plant.inertia, plant.damping, plant.gravity)
 
 
@@ -324,11 +333,13 @@ def _elastic_flow(
         drive.motor_damping,
         drive.reflected_inertia,
     )
+    from_hanging = angle - offset_of(plant, "angle_offset")
+    own = in_arithmetic(joint_torque, cmath)(from_hanging, velocity, *torques_of(plant))
     link = in_arithmetic(link_acceleration, cmath)(
-        angle - offset_of(plant, "angle_offset"),
+        from_hanging,
         velocity,
         spring,
-        push + offset_of(plant, "torque_offset"),
+        push + offset_of(plant, "torque_offset") + own,
         plant.inertia,
         plant.damping,
         plant.gravity,

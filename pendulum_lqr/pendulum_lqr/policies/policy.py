@@ -298,7 +298,7 @@ def plant_problem(policy: Policy, plant: PlantParameters) -> str:
 def _kind_of(plant: PlantParameters) -> str:
     if plant.is_pendulum:
         return "a plant of one joint"
-    return f"a {plant.mechanism.name} driven at {', '.join(plant.coordinates.driven_names) or 'no joint'}"
+    return f"a {plant.mechanism.model} driven at {', '.join(plant.coordinates.driven_names) or 'no joint'}"
 
 
 def require_plant(policy: Policy, plant: PlantParameters) -> None:

@@ -76,13 +76,13 @@ PUMPS: dict[tuple[str, str], PumpGains] = {
 def pump_gains(plant: PlantParameters) -> PumpGains:
     """Return the default gains of a plant; DesignError if it is not supported."""
     driven = plant.coordinates.driven_names
-    key = (plant.mechanism.name, driven[0] if len(driven) == 1 else "")
+    key = (plant.mechanism.model, driven[0] if len(driven) == 1 else "")
     if key not in PUMPS:
         known = ", ".join(f"{name} with a motor at the {joint} alone" for name, joint in PUMPS)
         motors = f"motors at {', '.join(driven)}" if driven else "no motor"
         raise DesignError(
-            f"energy_swing_up moves the hinge of a pendulum, and plant {plant.name!r} is a {plant.mechanism.name} with "
-            f"{motors}; expected {known}, or another controller: ilqr, nmpc"
+            f"energy_swing_up moves the hinge of a pendulum, and plant {plant.name!r} is a {plant.mechanism.model} "
+            f"with {motors}; expected {known}, or another controller: ilqr, nmpc"
         )
     return PUMPS[key]
 

@@ -55,6 +55,11 @@ class Joint:
         """Unit of viscous friction."""
         return "N m s/rad" if self.unit == "rad" else "N s/m"
 
+    @property
+    def drag_unit(self) -> str:
+        """Unit of quadratic drag."""
+        return "N m s^2/rad^2" if self.unit == "rad" else "N s^2/m^2"
+
 
 @dataclass(frozen=True)
 class Coordinates:

@@ -8,13 +8,16 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from pendulum_msgs_py.contract.joints import Joint
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES
 from pendulum_msgs_py.parameters import ParameterSpec
 
-__all__ = ["STANDARD_GRAVITY", "Body", "Mechanism", "Point", "Rotor", "gravity_spec", "positive"]
+__all__ = ["STANDARD_GRAVITY", "TORQUES_SUFFIX", "Body", "Mechanism", "Point", "Rotor", "gravity_spec", "positive"]
 
 STANDARD_GRAVITY = 9.81
 """Default of the acceleration of gravity [m/s^2]."""
 
+TORQUES_SUFFIX = "+torques"
+"""End of the name of a mechanism with joint torques, see :mod:`pendulum_msgs_py.mechanisms.joint_torques`."""
 _TILT = math.radians(25.0)
 """Elevation of the view of a spatial mechanism [rad]."""
 Point = tuple[float, float, float]
@@ -73,7 +76,7 @@ class Mechanism:
     numbers, arrays and symbols. ``p`` holds the values of ``parameters`` in order, then each joint's viscous damping.
 
     Attributes:
-        name: Name in plant files (``model:``).
+        name: Name; in plant files (``model:``) without the end for joint torques.
         title: One sentence.
         joints: n joints, in the order of messages.
         parameters: Table of its own parameters.
@@ -107,10 +110,17 @@ class Mechanism:
         return hash(self.name)  # quick: mechanisms are looked up for each plant
 
     @property
+    def model(self) -> str:
+        """Name in plant files, without joint torques."""
+        return self.name.removesuffix(TORQUES_SUFFIX)
+
+    @property
     def parameter_names(self) -> tuple[str, ...]:
         """Names of the entries of ``p``; the damping is ``JOINT.damping``, of a single joint ``damping``."""
-        damping = [f"{joint.name}.damping" for joint in self.joints] if len(self.joints) > 1 else ["damping"]
-        return (*(spec.name for spec in self.parameters), *damping)
+        torques = JOINT_TORQUES if self.name != self.model else ()
+        prefixes = [f"{joint.name}." for joint in self.joints] if len(self.joints) > 1 else [""]
+        own = (f"{prefix}{name}" for prefix in prefixes for name in torques)
+        return (*(spec.name for spec in self.parameters), *(f"{prefix}damping" for prefix in prefixes), *own)
 
     def seen(self, point: Point) -> tuple[float, float]:
         """Return a point's place in a picture, to the right and up [m]; in space it is seen from slightly above."""

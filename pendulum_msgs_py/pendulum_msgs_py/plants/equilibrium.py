@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from types import ModuleType
 from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_msgs_py.contract.angles import UPRIGHT, wrap
+from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES, periodic_torque
 from pendulum_msgs_py.dynamics.rigid import gravity_torque
 from pendulum_msgs_py.dynamics.series_elastic import (
     feedforward_pwm,
@@ -39,6 +42,7 @@ __all__ = [
     "overdamped_velocity",
     "resistance_of",
     "torque_gain",
+    "torques_of",
     "total_damping",
 ]
 
@@ -82,6 +86,11 @@ def drivetrain_of(plant: RigidPlant) -> SeriesElasticParameters | None:
 def offset_of(plant: RigidPlant, name: str) -> float:
     """Return a value of full plant parameters; 0 for a bare rigid plant."""
     return float(getattr(plant, name, 0.0))
+
+
+def torques_of(plant: RigidPlant) -> tuple[float, ...]:
+    """Return a plant's ``JOINT_TORQUES``; 0 for a bare rigid plant."""
+    return tuple(offset_of(plant, name) for name in JOINT_TORQUES)
 
 
 def resistance_of(drive: SeriesElasticParameters) -> float:
@@ -142,11 +151,14 @@ def is_overdamped(plant: RigidPlant) -> bool:
 
 
 def held_torque(plant: RigidPlant, theta: float) -> float:
-    """Return the actuator's torque on the link that holds it, G_c sin(theta - theta_0) - tau_0 [N m]."""
+    """Return the actuator's torque on the link that holds it, G_c sin(theta - theta_0) - tau_0 - t [N m].
+
+    t is the link's periodic torque.
+    """
     # sin(math.pi) is 1.2e-16, not 0: upright must not need a torque.
     angle = theta - offset_of(plant, "angle_offset")
     weight = 0.0 if angle == UPRIGHT else gravity_torque(angle, plant.gravity)
-    return weight - offset_of(plant, "torque_offset")
+    return weight - offset_of(plant, "torque_offset") - _periodic(plant, angle)
 
 
 def equilibrium_effort(plant: RigidPlant, theta: float) -> float:
@@ -163,13 +175,15 @@ def friction_effort(plant: PlantParameters, theta: float) -> float:
 
 
 def fixed_points(plant: RigidPlant, effort: float = 0.0) -> tuple[FixedPoint, ...]:
-    """Return the solutions of G_c sin(theta - angle_offset) = gain effort + torque_offset, the stable one first.
+    """Return the solutions of :func:`held_torque` = gain effort, the stable ones first.
 
     Raises:
         ParameterError: The torque is not finite.
     """
     if not math.isfinite(effort):
         raise ParameterError(f"torque is {effort} N m; expected a finite number")
+    if any(torques_of(plant)[1:]):
+        return _periodic_points(plant, effort)
     if plant.gravity == 0.0:
         return ()
     ratio = (torque_gain(plant) * effort + offset_of(plant, "torque_offset")) / plant.gravity
@@ -184,6 +198,29 @@ def fixed_points(plant: RigidPlant, effort: float = 0.0) -> tuple[FixedPoint, ..
     )
 
 
+def _periodic(plant: RigidPlant, angle: Any, arithmetic: ModuleType = math) -> Any:
+    own = torques_of(plant)[1:]
+    return in_arithmetic(periodic_torque, arithmetic)(angle, *own) if any(own) else 0.0
+
+
+def _periodic_points(plant: RigidPlant, effort: float) -> tuple[FixedPoint, ...]:
+    """Return the fixed points of a plant with periodic torques: roots of a polynomial of degree six in e^(i theta)."""
+    cos_2, sin_2, cos_3, sin_3 = torques_of(plant)[1:]
+    constant = torque_gain(plant) * effort + offset_of(plant, "torque_offset")
+    # a cos kx + b sin kx = (a - i b)/2 z^k + its conjugate, with z = e^(ix).
+    half = [0.5 * complex(a, -b) for a, b in ((cos_3, sin_3), (cos_2, sin_2), (0.0, -plant.gravity))]
+    roots = np.roots([*half, constant, *(value.conjugate() for value in reversed(half))])
+    found = []
+    for root in sorted(roots, key=np.angle):
+        angle = float(np.angle(root))
+        if abs(abs(root) - 1.0) < 1e-7:
+            around = (held_torque(plant, angle + offset_of(plant, "angle_offset") + h) for h in (1e-6, -1e-6))
+            found.append(
+                FixedPoint(wrap(angle + offset_of(plant, "angle_offset")), effort, next(around) > next(around))
+            )
+    return tuple(sorted(found, key=lambda point: not point.stable))
+
+
 def overdamped_velocity(plant: RigidPlant, theta: NDArray[np.float64], effort: float = 0.0) -> NDArray[np.float64]:
     """Return x' = (gain u_0 + tau_0 - G_c sin(x - theta_0)) / b, the limit of negligible inertia [rad/s].
 
@@ -194,4 +231,5 @@ def overdamped_velocity(plant: RigidPlant, theta: NDArray[np.float64], effort: f
     if not damping > 0.0:
         raise ParameterError(f"damping is {damping} N m s/rad; expected > 0 for the overdamped limit")
     torque = torque_gain(plant) * effort + offset_of(plant, "torque_offset")
+    torque = torque + _periodic(plant, theta - offset_of(plant, "angle_offset"), np)
     return (torque - plant.gravity * np.sin(theta - offset_of(plant, "angle_offset"))) / damping

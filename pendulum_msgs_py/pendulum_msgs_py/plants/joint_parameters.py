@@ -7,6 +7,7 @@ from functools import cache
 from typing import TYPE_CHECKING, Annotated
 
 from pendulum_msgs_py.contract.joints import Joint
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES, PERIODIC
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, term_fields
@@ -190,6 +191,21 @@ class JointParameters(_FrictionTerms):
         float, Quantity("effort_unit", "Constant torque that the sensor of effort misses.", signed=True)
     ] = 0.0
     angle_offset: Annotated[float, Quantity("unit", "Measured angle when hanging at rest.", signed=True)] = 0.0
+    quadratic_drag: Annotated[float, Quantity("drag_unit", "Drag by the square of the velocity, c in c v |v|.")] = 0.0
+    torque_cos_2: Annotated[
+        float, Quantity("effort_unit", "Torque by the cosine of twice the link's angle, as of cogging.", signed=True)
+    ] = 0.0
+    torque_sin_2: Annotated[
+        float, Quantity("effort_unit", "Torque by the sine of twice the link's angle, as of cogging.", signed=True)
+    ] = 0.0
+    torque_cos_3: Annotated[
+        float,
+        Quantity("effort_unit", "Torque by the cosine of three times the link's angle, as of cogging.", signed=True),
+    ] = 0.0
+    torque_sin_3: Annotated[
+        float,
+        Quantity("effort_unit", "Torque by the sine of three times the link's angle, as of cogging.", signed=True),
+    ] = 0.0
     lower_stop: Annotated[float | None, Quantity("unit", "Lowest position, at an end stop.", signed=True)] = None
     upper_stop: Annotated[float | None, Quantity("unit", "Highest position, at an end stop.", signed=True)] = None
     actuator: Actuator | None = None
@@ -201,6 +217,11 @@ class JointParameters(_FrictionTerms):
         return self.coulomb_friction if self.static_friction is None else self.static_friction
 
     @property
+    def torques(self) -> tuple[float, ...]:
+        """Values of ``JOINT_TORQUES``, 0 for none."""
+        return tuple(getattr(self, name) for name in JOINT_TORQUES)
+
+    @property
     def total_damping(self) -> float:
         """Viscous friction and, of a motor in volts, back EMF [N m s/rad or N s/m]."""
         motor = None if self.actuator is None else self.actuator.motor
@@ -210,7 +231,8 @@ class JointParameters(_FrictionTerms):
 @cache
 def joint_specs(joint: Joint) -> tuple[ParameterSpec, ...]:
     """Return the table of a joint's quantities in its units."""
-    return _in_units_of(joint, JointParameters)
+    specs = _in_units_of(joint, JointParameters)
+    return specs if joint.turns else tuple(spec for spec in specs if spec.name not in PERIODIC)
 
 
 @cache

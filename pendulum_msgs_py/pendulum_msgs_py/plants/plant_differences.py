@@ -58,7 +58,7 @@ def plant_differences(designed: PlantParameters, running: PlantParameters) -> tu
 
     If only one plant has a drivetrain, the links are compared and the drivetrain is named once.
     """
-    first, second = (plant.mechanism.name for plant in (designed, running))
+    first, second = (plant.mechanism.model for plant in (designed, running))
     if first != second:
         return (PlantDifference("model", first, second, ""),)
     found = []
@@ -121,7 +121,7 @@ def _as_mapping(plant: PlantParameters) -> dict[str, Any]:
         {key: value for key, value in asdict(joint).items() if key not in {*OF_A_PENDULUM, "drivetrain"}}
         for joint in plant.joints
     ]
-    return {"name": plant.name, "model": plant.mechanism.name, "values": list(plant.values), "joints": joints}
+    return {"name": plant.name, "model": plant.mechanism.model, "values": list(plant.values), "joints": joints}
 
 
 def _from_mapping(entry: Any) -> PlantParameters:

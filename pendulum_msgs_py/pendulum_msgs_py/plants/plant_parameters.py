@@ -42,8 +42,10 @@ from typing import Any, NamedTuple
 from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.contract.joints import Coordinates, Joint, Vector
 from pendulum_msgs_py.dynamics.joint_steps import FAR, JointTable
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.mechanisms import MECHANISMS, Mechanism
+from pendulum_msgs_py.mechanisms.mechanism import TORQUES_SUFFIX
 from pendulum_msgs_py.parameters import (
     ParameterSpec,
     dump_yaml,
@@ -144,7 +146,7 @@ def _places(mechanism: Mechanism) -> dict[str, _Place]:
     several = len(mechanism.joints) > 1
     for index, joint in enumerate(mechanism.joints):
         for part, specs in (
-            ("joint", joint_specs(joint) if mechanism.name == _PENDULUM.name else _format_2(joint)),
+            ("joint", joint_specs(joint) if mechanism.model == _PENDULUM.name else _format_2(joint)),
             ("actuator", actuator_specs(joint)),
             ("motor", motor_specs(joint)),
         ):
@@ -157,9 +159,10 @@ def _places(mechanism: Mechanism) -> dict[str, _Place]:
                 found[name] = _Place(shown, part, index, spec.name, where)
     if several:
         return found
-    # As in files: required ones first, friction terms last.
+    # As in files: required ones first, friction terms and joint torques last.
     order = {name: rank for rank, name in enumerate(_REQUIRED, -len(_REQUIRED))}
-    return dict(sorted(found.items(), key=lambda each: order.get(each[0], each[0] in TERM_PARAMETERS)))
+    order |= {**dict.fromkeys(TERM_PARAMETERS, 1), **dict.fromkeys(JOINT_TORQUES, 2)}
+    return dict(sorted(found.items(), key=lambda each: order.get(each[0], 0)))
 
 
 def _name(mechanism: Mechanism, joint: Joint, key: str) -> str:
@@ -200,6 +203,11 @@ class _Pendulum:
     actuator_time_constant: float
     transport_delay: float
     load_friction: float
+    quadratic_drag: float
+    torque_cos_2: float
+    torque_sin_2: float
+    torque_cos_3: float
+    torque_sin_3: float
 
 
 @dataclass(frozen=True)
@@ -216,6 +224,8 @@ class PlantParameters(_Pendulum):
     name: str = field(default="unnamed", compare=False)
 
     def __post_init__(self) -> None:
+        torques = TORQUES_SUFFIX if any(any(own.torques) for own in self.joints) else ""
+        object.__setattr__(self, "mechanism", MECHANISMS[f"{self.mechanism.model}{torques}"])
         specs = self.mechanism.parameters
         if len(self.values) != len(specs) or len(self.joints) != len(self.mechanism.joints):
             raise ParameterError(
@@ -294,7 +304,7 @@ class PlantParameters(_Pendulum):
         """Whether it is one hinge, driven by a torque, without end stops."""
         own = self.joints[0]
         return (
-            self.mechanism.name == _PENDULUM.name
+            self.mechanism.model == _PENDULUM.name
             and own.actuator is not None
             and own.actuator.motor is None
             and own.lower_stop is own.upper_stop is None
@@ -313,8 +323,14 @@ class PlantParameters(_Pendulum):
 
     @cached_property
     def packed(self) -> Vector:
-        """The mechanism's ``p``: values, then the damping of each joint, with that of its motor's back EMF."""
-        return (*self.values, *(joint.total_damping for joint in self.joints))
+        """The mechanism's ``p``: values, dampings of the joints with back EMF, and joint torques if it has any."""
+        p = (*self.values, *(joint.total_damping for joint in self.joints))
+        return (*p, *(value for own in self.joints for value in own.torques)) if self.has_torques else p
+
+    @property
+    def has_torques(self) -> bool:
+        """Whether a joint has quadratic drag or a periodic torque."""
+        return self.mechanism.name != self.mechanism.model
 
     @cached_property
     def torque_plant(self) -> PlantParameters:
@@ -603,8 +619,8 @@ def load_plant(preset_or_path: str | Path) -> PlantParameters:
     parameters = load_mechanism(preset_or_path)
     if not parameters.is_pendulum:
         raise ParameterError(
-            f"plant file {resolve_plant(preset_or_path)} describes a mechanism ({parameters.mechanism.name}); expected "
-            f"a plant of one joint here, as {PRESET_NAMES}"
+            f"plant file {resolve_plant(preset_or_path)} describes a mechanism ({parameters.mechanism.model}); "
+            f"expected a plant of one joint here, as {PRESET_NAMES}"
         )
     return parameters
 
@@ -773,7 +789,7 @@ def plant_document(
             joints[joint.name]["actuator"] = {**write_quantities(vars(own.actuator), drives, of_joint), **entry}
     own_values = write_quantities(parameters.numbers, mechanism.parameters, known)
     return {
-        **document, "format": MECHANISM_FORMAT, "model": mechanism.name, "parameters": own_values, "joints": joints
+        **document, "format": MECHANISM_FORMAT, "model": mechanism.model, "parameters": own_values, "joints": joints
     }  # fmt: skip
 
 

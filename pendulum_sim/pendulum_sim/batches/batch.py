@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from pendulum_msgs_py.contract.joints import Coordinates
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
 from pendulum_msgs_py.dynamics.joint_steps import COULOMB, JOINT_ROWS, LOWER, STATIC, UPPER
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.joint_parameters import Motor
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, common_delay, pack_joints
@@ -153,7 +154,8 @@ def _coordinates_of(plants: Sequence[PlantParameters]) -> Coordinates:
     for plant in plants:
         if plant.drivetrain is not None:
             raise ParameterError(f"a batch takes rigid plants; plant {plant.name!r} is series elastic")
-        if plant.coordinates != first.coordinates or plant.is_pendulum != first.is_pendulum:
+        kinds = {(one.coordinates, one.mechanism.name, one.is_pendulum) for one in (first, plant)}
+        if len(kinds) > 1:
             raise ParameterError(f"plants {first.name!r} and {plant.name!r} of a batch differ; expected one mechanism")
     return first.coordinates
 
@@ -220,7 +222,8 @@ def _pendulum_rows(plants: Sequence[PlantParameters], varied: Columns, method: s
         check_stability(integrator, wrong, batch.dt, batch.substeps, h)
     late = any(plant.transport_delay for plant in plants)
     smooth = not (late or any(packed[PACKED[index]].any() for index in (*DRY, LAG)))
-    return _Rows(Layout(method), list(packed.values()), list(coefficients), smooth)
+    torques = any(np.any(packed[name]) for name in JOINT_TORQUES)
+    return _Rows(Layout(method, torques=torques), list(packed.values()), list(coefficients), smooth)
 
 
 def _motors(plants: Sequence[PlantParameters], varied: Columns) -> list[Motor]:

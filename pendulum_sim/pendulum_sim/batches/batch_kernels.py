@@ -24,7 +24,7 @@ from pendulum_msgs_py.mechanisms import MECHANISMS
 from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 from pendulum_sim.batches import vector_math
 from pendulum_sim.batches.compiling import WITHIN, compile_tree, tuple_loader
-from pendulum_sim.stepping.dry_friction import PACKED, acceleration_with_friction, is_dry
+from pendulum_sim.stepping.dry_friction import PACKED, is_dry, link_acceleration_of
 from pendulum_sim.stepping.integrators import get_integrator
 from pendulum_sim.stepping.plant import advance_rigid
 
@@ -45,11 +45,13 @@ class Layout:
         method: Integrator of a rigid link.
         mechanism: Name of a mechanism, which Runge-Kutta integrates; empty for a rigid link.
         driven: Indices of the driven joints.
+        torques: Whether a rigid link has torques of its own.
     """
 
     method: str
     mechanism: str = ""
     driven: tuple[int, ...] = (0,)
+    torques: bool = False
 
     @property
     def turns(self) -> tuple[bool, ...]:
@@ -332,7 +334,7 @@ def _move_link(layout: Layout, lanes: int, *, gpu: bool) -> Any:
     o = layout.offsets(lanes)
     o_v, o_effort, o_p, o_table = (o[key] for key in ("v", "effort", "p", "table"))
     step = compile_tree(get_integrator(layout.method).step, vector=True, gpu=gpu)
-    acceleration = compile_tree(acceleration_with_friction, vector=True, gpu=gpu)
+    acceleration = compile_tree(link_acceleration_of(layout.torques), vector=True, gpu=gpu)
     load_plant = tuple_loader(len(PACKED), lanes)
     load_coefficients = tuple_loader(layout.starts["end"] - layout.starts["table"], lanes)
 
@@ -419,7 +421,13 @@ def _advance_link(layout: Layout) -> tuple[Any, Any]:
     integrator = get_integrator(layout.method)
     step, coefficients_of, acceleration, advance_one, has_dry_friction = (
         compile_tree(function, inline=True)
-        for function in (integrator.step, integrator.coefficients, acceleration_with_friction, advance_rigid, is_dry)
+        for function in (
+            integrator.step,
+            integrator.coefficients,
+            link_acceleration_of(layout.torques),
+            advance_rigid,
+            is_dry,
+        )
     )
     load_plant = tuple_loader(len(PACKED), 1)
     o_p = layout.starts["p"]

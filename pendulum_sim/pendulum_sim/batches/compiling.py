@@ -40,7 +40,7 @@ def _vector_math(*, gpu: bool) -> dict[ModuleType, ModuleType]:
         else numba.njit(function, fastmath={"contract"}, forceinline=True)
         for function in (vector_math.sin, vector_math.cos)
     )
-    return {math: _module("vector_math_compiled", sin=sin, cos=cos, exp=math.exp)}
+    return {math: _module("vector_math_compiled", sin=sin, cos=cos, exp=math.exp, sqrt=math.sqrt)}
 
 
 @cache

@@ -18,7 +18,7 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 from pendulum_msgs_py.programs.kernel_cache import keep_kernel
 from pendulum_sim.batches import vector_math
 from pendulum_sim.batches.compiling import compile_tree, tuple_loader
-from pendulum_sim.stepping.dry_friction import PACKED, acceleration_with_friction
+from pendulum_sim.stepping.dry_friction import PACKED, link_acceleration_of
 from pendulum_sim.stepping.integrators import get_integrator
 from pendulum_sim.stepping.plant import pack
 from pendulum_sim.stepping.stability import check_stability
@@ -45,13 +45,13 @@ def lane_table(
 
 
 @cache
-def step_kernel(method: str, lanes: int) -> Any:
+def step_kernel(method: str, lanes: int, *, torques: bool = False) -> Any:
     """Return ``step(w, keys, counts, hold, h, substeps, actions, observations, rewards)`` for a number of pendulums."""
     plant_rows = len(PACKED)
     integrator = get_integrator(method)
     coefficient_rows = len(integrator.coefficients(1.0, 1e-3))
     step = compile_tree(integrator.step, vector=True)
-    acceleration = compile_tree(acceleration_with_friction, vector=True)
+    acceleration = compile_tree(link_acceleration_of(torques), vector=True)
     scramble, unit = compile_tree(noise.scramble), compile_tree(noise.unit_interval)
     wrap = compile_tree(vector_math.wrap)
     load_plant = tuple_loader(plant_rows, lanes)
@@ -91,4 +91,4 @@ def step_kernel(method: str, lanes: int) -> Any:
             observations[2 * j] = wrap(w[j] - UPRIGHT)
             observations[2 * j + 1] = w[o_v + j]
 
-    return keep_kernel(run, "step_kernel", integrator.step, lanes)
+    return keep_kernel(run, "step_kernel", integrator.step, lanes, torques)

@@ -37,7 +37,7 @@ class Lanes:
         self.counts = np.zeros((blocks, lanes), dtype=np.int64)
         self._actions = np.zeros((blocks, lanes))
         self._flat = self._actions.reshape(-1)
-        self.kernel = step_kernel(method, lanes)
+        self.kernel = step_kernel(method, lanes, torques=task.parameters.has_torques)
 
     @property
     def steps(self) -> NDArray[np.int64]:

@@ -18,6 +18,7 @@ import typer
 from pendulum_msgs_py.atomic_write import write_atomically, writing
 from pendulum_msgs_py.contract.joints import Joint
 from pendulum_msgs_py.contract.names import JOINT
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.mechanisms import Body
 from pendulum_msgs_py.mechanisms.mechanism import STANDARD_GRAVITY
@@ -101,6 +102,17 @@ def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: 
         parent = body.name
     add_ros2_control(robot, ros2_control, namespace, limit)
     return document_text(robot)
+
+
+def _refuse_torques(parameters: PlantParameters, kind: str) -> None:
+    for joint, own in zip(parameters.mechanism.joints, parameters.joints, strict=True):
+        for name, value in zip(JOINT_TORQUES, own.torques, strict=True):
+            if value != 0.0:
+                unit = joint.drag_unit if name == "quadratic_drag" else joint.effort_unit
+                raise ParameterError(
+                    f"{name} of {joint.name} is {value:g} {unit}, which {kind.upper()} cannot express; expected a "
+                    "plant without quadratic drag and periodic torques: set them to 0 for an export without them"
+                )
 
 
 def mjcf(parameters: PlantParameters) -> str:
@@ -279,6 +291,7 @@ def export(
     if kind == "mjcf" and ros2_control != "none":
         raise ParameterError(f"ros2_control is {ros2_control!r} for mjcf; expected --format urdf, MuJoCo knows none")
     parameters = load_mechanism(plant)
+    _refuse_torques(parameters, kind)
     text = mjcf(parameters) if kind == "mjcf" else urdf(parameters, ros2_control=ros2_control, namespace=namespace)
     if output is None:
         typer.echo(text, nl=False)

@@ -9,19 +9,19 @@ from pendulum_msgs_py.loops.plant_kernel import plant_loop
 from pendulum_msgs_py.loops.primitives import compiled
 from pendulum_msgs_py.loops.trees import compile_tree, tuple_loader
 from pendulum_sim.simulator.loop_plant import LAYOUT, MOST_COEFFICIENTS
-from pendulum_sim.stepping.dry_friction import PACKED, acceleration_with_friction
+from pendulum_sim.stepping.dry_friction import PACKED, link_acceleration_of
 from pendulum_sim.stepping.integrators import get_integrator
 from pendulum_sim.stepping.plant import advance_rigid
 
 __all__ = ["rigid_loop"]
 
 
-def rigid_loop(method: str) -> Any:
-    """Return the compiled loop of a rigid plant with an integrator."""
+def rigid_loop(method: str, torques: str = "") -> Any:
+    """Return the compiled loop of a rigid plant with an integrator; ``torques`` if its link has some of its own."""
     integrator = get_integrator(method)
     step = compile_tree(integrator.step, exact=True)
     coefficients_of = compile_tree(integrator.coefficients, exact=True)
-    acceleration = compile_tree(acceleration_with_friction, exact=True)
+    acceleration = compile_tree(link_acceleration_of(bool(torques)), exact=True)
     advance = compile_tree(advance_rigid, exact=True)
     clamp = compile_tree(within, exact=True)
     load_plant = tuple_loader(len(PACKED), 1)

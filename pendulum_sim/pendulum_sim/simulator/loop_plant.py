@@ -48,7 +48,7 @@ class LoopPlant:
     def __init__(self, plant: RigidPlant) -> None:
         self.plant = plant
         self.builder = BUILDER
-        self.choice = (plant.method,)
+        self.choice: tuple[str, ...] = (plant.method, "torques") if plant.parameters.has_torques else (plant.method,)
         self.layout = LAYOUT
 
     def describe(self, record: Any) -> None:

@@ -2,10 +2,11 @@
 
 ::
 
-    M_c theta'' + b_c theta' + F sgn(theta') + G_c sin(theta - theta_0) = tau + tau_0 + push
+    M_c theta'' + b_c theta' + F sgn(theta') + G_c sin(theta - theta_0) = tau + tau_0 + t + push
     F = tau_C' + (tau_S' - tau_C') exp(-(theta' / v_s)^2),   tau' = tau + a(|theta'|, |G_c sin(theta - theta_0)|)
 
-a is the sum of the friction terms of :mod:`pendulum_msgs_py.plants.friction_terms`. Between events the direction of
+a is the sum of the friction terms of :mod:`pendulum_msgs_py.plants.friction_terms`, t the link's own torque, of
+:mod:`pendulum_msgs_py.dynamics.joint_torques` at theta - theta_0. Between events the direction of
 friction is fixed and the equation smooth, so each integrator keeps its order. A zero crossing of the velocity is
 located inside the step; there the link sticks, exactly at rest, while |net torque| <= tau_S'.
 
@@ -16,17 +17,29 @@ located instead of a velocity band, which would creep.
 from __future__ import annotations
 
 from pendulum_msgs_py.dynamics import friction_magnitude, gravity_torque, rigid_acceleration
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES, joint_torque, periodic_torque
 from pendulum_msgs_py.dynamics.steps import actuator_torque, narrowed
 from pendulum_msgs_py.plants.friction_terms import STRENGTHS, added_friction
 from pendulum_msgs_py.plants.plant_parameters import PLANT_SPECS
 from pendulum_sim.stepping.integrators import Acceleration, Coefficients, PlantTuple, Step
 
-__all__ = ["DRY", "LAG", "PACKED", "acceleration_with_friction", "advance_dry", "is_dry", "static_friction_balance"]
+__all__ = [
+    "DRY",
+    "LAG",
+    "PACKED",
+    "acceleration_with_friction",
+    "acceleration_with_torques",
+    "advance_dry",
+    "is_dry",
+    "link_acceleration_of",
+    "static_friction_balance",
+]
 
 PACKED = tuple(spec.name for spec in PLANT_SPECS if spec.name not in {"effort_limit", "transport_delay"})
 """Order of the values in a ``PlantTuple``."""
 _INERTIA, _DAMPING, _GRAVITY, _COULOMB, _STATIC, _STRIBECK, _OFFSET, _ANGLE, LAG, _TERMS = range(10)
-"""Indices in it; ``LAG`` is the actuator's time constant, the friction terms come last."""
+"""Indices in it; ``LAG`` is the actuator's time constant, friction terms and ``JOINT_TORQUES`` come last."""
+_DRAG, _COS_2, _SIN_2, _COS_3, _SIN_3 = (PACKED.index(name) for name in JOINT_TORQUES)
 _added_friction = added_friction(PACKED)
 DRY = (_STATIC, *(_TERMS + index for index in STRENGTHS))
 """Indices of the values that are all 0 without dry friction."""
@@ -52,9 +65,27 @@ def acceleration_with_friction(
     return rigid_acceleration(angle, theta_dot, torque, plant[_INERTIA], plant[_DAMPING], gravity)
 
 
+def acceleration_with_torques(
+    theta: float, theta_dot: float, torque: float, direction: float, plant: PlantTuple
+) -> float:
+    """Return theta'' of a link with torques of its own; arguments as :func:`acceleration_with_friction`."""
+    own: float = joint_torque(
+        theta - plant[_ANGLE], theta_dot, plant[_DRAG], plant[_COS_2], plant[_SIN_2], plant[_COS_3], plant[_SIN_3]
+    )
+    return acceleration_with_friction(theta, theta_dot, torque + own, direction, plant)
+
+
+def link_acceleration_of(torques: bool) -> Acceleration:
+    """Return the equation of a link with or without torques of its own; without, it costs nothing."""
+    return acceleration_with_torques if torques else acceleration_with_friction
+
+
 def static_friction_balance(theta: float, torque: float, plant: PlantTuple) -> tuple[float, float]:
     """Return the net torque on a link at rest and the largest static friction tau_S' [N m]."""
-    weight = gravity_torque(theta - plant[_ANGLE], plant[_GRAVITY])
+    angle = theta - plant[_ANGLE]
+    weight = gravity_torque(angle, plant[_GRAVITY])
+    if plant[_COS_2] != 0.0 or plant[_SIN_2] != 0.0 or plant[_COS_3] != 0.0 or plant[_SIN_3] != 0.0:
+        torque = torque + periodic_torque(angle, plant[_COS_2], plant[_SIN_2], plant[_COS_3], plant[_SIN_3])
     return torque + plant[_OFFSET] - weight, plant[_STATIC] + _added_friction(0.0, abs(weight), plant)
 
 
@@ -72,7 +103,7 @@ def advance_dry(
 ) -> tuple[float, float]:  # fmt: skip
     """Return (theta, theta_dot) after h [s], with as many events as occur.
 
-    ``coefficients_of`` serves steps cut short by an event; ``acceleration`` is :func:`acceleration_with_friction`,
+    ``coefficients_of`` serves steps cut short by an event; ``acceleration`` is of :func:`link_acceleration_of`,
     compiled or not; ``c`` are the coefficients for h. Torques [N m]: the actuator's at the start, the command, and a
     push on the link.
     """

@@ -12,11 +12,10 @@ from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
-from pendulum_msgs_py.dynamics import rigid_energy
 from pendulum_msgs_py.dynamics.steps import actuator_torque
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
-from pendulum_sim.stepping.dry_friction import LAG, PACKED, acceleration_with_friction, advance_dry, is_dry
+from pendulum_sim.stepping.dry_friction import LAG, PACKED, advance_dry, is_dry, link_acceleration_of
 from pendulum_sim.stepping.integrators import Acceleration, Coefficients, PlantTuple, Step, get_integrator
 from pendulum_sim.stepping.stability import check_stability
 
@@ -169,6 +168,7 @@ class RigidPlant:
         self.packed = pack(parameters)
         self._limit = parameters.effort_limit
         self.dry = is_dry(self.packed)
+        self._acceleration = link_acceleration_of(parameters.has_torques)
         self.steps = 0
         self.theta = 0.0
         self.theta_dot = 0.0
@@ -197,7 +197,7 @@ class RigidPlant:
         theta, theta_dot, torque = self.theta, self.theta_dot, self.effort
         for is_newer, h, c in self.segments:
             theta, theta_dot, torque = advance_rigid(
-                self._step, self._coefficients_of, acceleration_with_friction, theta, theta_dot, torque,
+                self._step, self._coefficients_of, self._acceleration, theta, theta_dot, torque,
                 newer if is_newer else older, push, h, c, self.packed, self.dry,
             )  # fmt: skip
         self.theta, self.theta_dot, self.effort = theta, theta_dot, torque
@@ -207,10 +207,7 @@ class RigidPlant:
     @property
     def energy(self) -> float:
         """Kinetic and potential energy, 0 at rest hanging down [J]."""
-        parameters = self.parameters
-        return rigid_energy(
-            self.theta - parameters.angle_offset, self.theta_dot, parameters.inertia, parameters.gravity
-        )
+        return self.parameters.energy((self.theta - self.parameters.angle_offset,), (self.theta_dot,))
 
 
 def command_within(limit: float, effort: float, push: float) -> float:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_msgs_py.dynamics import friction_magnitude, gravity_torque
+from pendulum_msgs_py.dynamics.joint_torques import joint_torque
 from pendulum_msgs_py.dynamics.series_elastic import (
     dahl_step,
     dry_friction_step,
@@ -39,6 +40,8 @@ MAX_SUBSTEP = 2.5e-4
 SeriesElasticTuple = tuple[float, ...]
 _TERMS = 21
 """Index of the first friction term."""
+_TORQUES = _TERMS + len(TERM_PARAMETERS)
+"""Index of the first of the link's ``JOINT_TORQUES``."""
 _added_friction = added_friction((*[""] * _TERMS, *TERM_PARAMETERS))
 
 
@@ -55,7 +58,7 @@ def pack_series_elastic(parameters: PlantParameters) -> SeriesElasticTuple:
         drive.reflected_inertia, drive.motor_damping,
         drive.motor_coulomb_friction, drive.motor_static_friction, drive.motor_stribeck_velocity,
         drive.stiffness, drive.stiffness_hardening, drive.hysteresis_torque, drive.hysteresis_deflection,
-        *terms_of(parameters),
+        *terms_of(parameters), *parameters.joints[0].torques,
     )  # fmt: skip
 
 
@@ -83,6 +86,9 @@ def series_elastic_step(
     v_m = dry_friction_step(
         v_m_free, friction_magnitude(v_m, motor_coulomb, motor_static, motor_stribeck_velocity), motor_inertia, h
     )
+    drag, cos_2, sin_2, cos_3, sin_3 = plant[_TORQUES:]
+    if drag != 0.0 or cos_2 != 0.0 or sin_2 != 0.0 or cos_3 != 0.0 or sin_3 != 0.0:
+        disturbance += joint_torque(q - angle_offset, v, drag, cos_2, sin_2, cos_3, sin_3)
     v_free = v + h * link_acceleration(q - angle_offset, v, spring, disturbance, inertia, damping, gravity)
     added = _added_friction(abs(v), abs(gravity_torque(q - angle_offset, gravity)), plant)
     v = dry_friction_step(v_free, friction_magnitude(v, coulomb + added, static + added, stribeck_velocity), inertia, h)

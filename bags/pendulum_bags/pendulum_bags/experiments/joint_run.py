@@ -216,7 +216,7 @@ def load_surrogate(path: str | Path, plant: PlantParameters) -> PlantParameters:
     """Return the surrogate in a file or preset; a ParameterError if its equations or joints differ from ``plant``."""
     found = load_mechanism(path)
     for what, ours, others in (
-        ("model", plant.mechanism.name, found.mechanism.name),
+        ("model", plant.mechanism.model, found.mechanism.model),
         ("driven joints", ", ".join(plant.coordinates.driven_names), ", ".join(found.coordinates.driven_names)),
     ):
         if ours != others:
