@@ -69,15 +69,21 @@ def test_commands_that_build_on_each_other_run(page: Path, run_line: RunLine, do
 
 @pytest.mark.parametrize("page", TOGETHER, ids=lambda page: str(page.relative_to(PROJECT)))
 def test_programs_that_a_page_starts_together_leave_what_it_looks_at_then(
-    page: Path, processes: ProcessGroup, run_line: RunLine, domain_id: int, tmp_path: Path
+    page: Path,
+    processes: ProcessGroup,
+    run_line: RunLine,
+    domain_id: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The last of them is a disturbance with a duration; the recorder is ended first."""
     together, then = _TOGETHER.findall(page.read_text(encoding="utf-8"))[0]
     recorders: list[RunningProgram] = []
     others: list[RunningProgram] = []
+    monkeypatch.chdir(tmp_path)
     for line in together.splitlines():
         words = shlex.split(line.removeprefix("$ "))
-        program = processes.start(words[2], words[3], *words[4:], cwd=tmp_path)
+        program = processes.start(words[2], words[3], *words[4:])
         program.wait_for_output(r"\[INFO\].*ready", 200)
         (recorders if words[3] == "record" else others).append(program)
     others[-1].wait_for_output("noise_end", 200)

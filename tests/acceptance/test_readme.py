@@ -125,7 +125,8 @@ def test_command_of_a_page_runs(
         pytest.skip("the recordings of real pendulums are not at hand")
     words = shlex.split(command)
     if words[0] == "python" and words[1] == "-m" and words[3] in NODES:
-        program = processes.start(words[2], words[3], *words[4:], cwd=tmp_path)
+        monkeypatch.chdir(tmp_path)
+        program = processes.start(words[2], words[3], *words[4:])
         program.wait_for_output(r"\[INFO\]|recording to", 200)
         program.interrupt()
         assert program.wait(60) == 0, program.output

@@ -25,6 +25,8 @@ from tests.integration.adopting import adopt, adopt_cart_pole, start_robot, writ
 
 pytest.importorskip("mujoco")
 
+_AT_REST = ("-r", "__ns:=/lab", "-p", "armed_at_start:=false", "-p", "rate_hz:=100.0")
+
 
 @pytest.fixture
 def peer(domain_id: int) -> Iterator[PlantPeer]:
@@ -108,7 +110,7 @@ def test_a_plant_that_is_armed_or_commanded_or_not_there_is_left_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO())
-    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/lab", "-p", "armed_at_start:=false")
+    processes.start("pendulum_sim", "simulator", "--ros-args", *_AT_REST)
     peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "the plant")
     out = tmp_path / "run"
 
@@ -131,7 +133,7 @@ def test_a_plant_that_is_armed_or_commanded_or_not_there_is_left_alone(
 def test_a_commander_who_is_met_later_than_the_plant_is_noticed(
     processes: ProcessGroup, domain_id: int, peer: PlantPeer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/lab", "-p", "armed_at_start:=false")
+    processes.start("pendulum_sim", "simulator", "--ros-args", *_AT_REST)
     peer.until(lambda: peer.diagnostics.get("mode") == "disarmed", "the plant")
     asked: list[str] = []
     with Orchestrator(domain_id) as orchestrator:

@@ -18,14 +18,8 @@ from pendulum_testing.processes import ProcessGroup
 
 _PATIENCE = 60.0
 """[s]"""
-_ENDS = {
-    "SIGINT": signal.SIGINT,
-    "SIGTERM": signal.SIGTERM,
-    "SIGHUP": signal.SIGHUP,
-    "SIGKILL": signal.SIGKILL,
-    "crash": signal.SIGSEGV,
-    "closed terminal": None,
-}
+_ENDS = {"SIGTERM": signal.SIGTERM, "SIGKILL": signal.SIGKILL, "closed terminal": None}
+"""A closed terminal is a SIGHUP, and a crash ends a process as SIGKILL does; for Ctrl-C: test_experiment.py."""
 _LIFTED = (
     "import os, signal, sys; signal.signal(signal.SIGHUP, signal.SIG_DFL); "
     "sys.argv[1] and os.open(sys.argv[1], os.O_RDWR); os.execv(sys.executable, [sys.executable, *sys.argv[2:]])"
@@ -56,7 +50,7 @@ def start_run(hosts):
     metadata = folder / "metadata.json"
     metadata.write_text("{}")
     with hosts as pool, ProcessSet(folder / "logs", {}, pool) as processes:
-        processes.start_node(graph.simulator("/sim", start="top"))
+        processes.start_node(graph.simulator("/sim", start="top", rate_hz=100.0))
         processes.start_node(graph.controller("/sim", autoactivate=False))
         start_recorder(processes, folder / "bag", "/sim", metadata, "mcap")
         go_on()

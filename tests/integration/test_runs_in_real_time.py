@@ -16,36 +16,34 @@ from pendulum_bags.experiments.session import LOOP_NICENESS, conduct
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.errors import FaultError, PlantStoppedError
+from pendulum_msgs_py.programs.executables import run_package
 from pendulum_rosbag.reader import read_bag
 from pendulum_testing.fixtures import wait_for
 from pendulum_testing.processes import ProcessGroup
 
+SLOW = ("--ros-args", "-p", "rate_hz:=100.0")
+
 
 def test_an_excitation_is_played_alone_on_a_running_plant_and_ends_at_zero_torque(
-    processes: ProcessGroup, domain_id: int, tmp_path: Path
+    processes: ProcessGroup, domain_id: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     zero = tmp_path / "zero.csv"
     zero.write_text("time,effort\n0,0\n1,0\n", encoding="utf-8")
-    simulator = processes.start(
-        "pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", "-p", "plant:=dfki", "-p", "rate_hz:=100.0"
-    )
+    simulator = processes.start("pendulum_sim", "simulator", *SLOW, "-r", "__ns:=/sim", "-p", "plant:=dfki")
     playback = ("--ros-args", "-r", "__ns:=/sim", "-p", "controller:=playback", "-p", f"file:={zero}")
     other = processes.start("pendulum_lqr", "controller", *playback)
     simulator.wait_for_output("commanded by /sim/controller", 60)
     bag = tmp_path / "excited"
-    command = [sys.executable, "-m", "pendulum_bags", "excite", "--plant", "dfki", "--max-angle", "0.5"]
-    command += ["--duration", "1", "--trials", "3", "--out", str(tmp_path / "e.csv"), "--bag", str(bag)]
-    command += ["--play", "--on", "running"]
+    command = ["excite", "--plant", "dfki", "--max-angle", "0.5", "--duration", "1", "--trials", "3"]
+    command += ["--out", str(tmp_path / "e.csv"), "--bag", str(bag), "--play", "--on", "running"]
 
-    refused = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-    assert refused.returncode == 2
-    assert "/sim/effort_command has a publisher, /sim/controller; expected none" in refused.stderr
+    assert run_package("pendulum_bags", command) == 2
+    assert "/sim/effort_command has a publisher, /sim/controller; expected none" in capfd.readouterr().err
     assert not bag.exists()
 
     other.interrupt()
     assert other.wait(20) == 0
-    done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
+    assert run_package("pendulum_bags", command) == 0, capfd.readouterr()
     recorded = read_bag(bag)
     applied = recorded["/sim/applied_effort"]["effort"]
     assert 0.1 < np.max(np.abs(applied)) <= 0.75
@@ -57,7 +55,7 @@ def test_what_breaks_a_session_off_disarms_a_plant_that_it_drives_and_no_other(
     processes: ProcessGroup, domain_id: int, tmp_path: Path
 ) -> None:
     simulators = {
-        namespace: processes.start("pendulum_sim", "simulator", "--ros-args", "-r", f"__ns:={namespace}")
+        namespace: processes.start("pendulum_sim", "simulator", *SLOW, "-r", f"__ns:={namespace}")
         for namespace in ("/sim", "/other", "/done")
     }
     ended: list[Child] = []
@@ -90,7 +88,7 @@ def test_what_breaks_a_session_off_disarms_a_plant_that_it_drives_and_no_other(
 def test_a_move_that_a_stopped_plant_refuses_is_reported_by_what_stopped_it(
     processes: ProcessGroup, domain_id: int, tmp_path: Path
 ) -> None:
-    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim")
+    processes.start("pendulum_sim", "simulator", *SLOW, "-r", "__ns:=/sim")
     with conduct(tmp_path / "logs", domain_id) as session:
         plant = PlantClient(session.orchestrator, "/sim", "simulator")
         plant.wait_until_ready(60.0, controller=False, disturbance=False)

@@ -10,16 +10,16 @@ from pathlib import Path
 
 import pytest
 
+from pendulum_bags.commands.experiment_cli import main
 from pendulum_bags.experiments.graph_plant import join
 from pendulum_bags.experiments.session import conduct
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.errors import FaultError
-from pendulum_msgs_py.plants.plant_parameters import load_plant, write_plant
 from pendulum_testing.fixtures import PROJECT, own_domain, wait_for
 from pendulum_testing.plant_peer import PlantPeer
-from pendulum_testing.processes import ProcessGroup, RunningProgram
-from tests.integration.adopting import adopt, start_robot, write_model
+from pendulum_testing.processes import ProcessGroup
+from tests.integration.adopting import adopt, start_robot
 
 pytest.importorskip("mujoco")
 
@@ -74,49 +74,24 @@ def lab(running: Laboratory) -> Laboratory:
     return running
 
 
-def begin(processes: ProcessGroup, lab: Laboratory, folder: Path) -> RunningProgram:
-    """Start an experiment with the adopted plant as the simulation, and wait until it is on its way up."""
-    model, plant = write_model(folder / "model.xml"), write_plant(folder / "plant.yaml", load_plant("thesis"))
-    before = lab.peer.states[-1].position[0]
-    run = processes.start(
-        "pendulum_bags", "experiment", "thesis", "--out", folder / "run", "--domain", str(lab.domain),
-        "--duration", "1", "--budget", "0", "--simulation", "ros:/lab", "--plant", plant, "--hardware", model, "--yes",
-        alone=True,
-    )  # fmt: skip
-    lab.peer.until(
-        lambda: run.returncode is not None or lab.peer.states[-1].position[0] > before + 0.1, "the way up", 90.0
-    )
-    assert run.returncode is None, run.output
-    return run
-
-
-def test_ctrl_c_disarms_a_plant_that_somebody_else_started(
-    processes: ProcessGroup, lab: Laboratory, tmp_path: Path
-) -> None:
-    said = len(lab.adopter.output)
-    run = begin(processes, lab, tmp_path)
-    run.interrupt()
-    assert run.wait(60.0) == 130
-    # It was on its way up by itself: without a word it would go on to upright.
-    moved = r"armed_position: following a trajectory\n(?s:.*)\bdisarmed\b"
-    wait_for(lambda: re.search(moved, lab.adopter.output[said:]), 10.0, "the adopted plant to be disarmed")
-    assert lab.robot.returncode is None
-    assert lab.adopter.returncode is None
-
-
 @pytest.mark.parametrize(
-    ("what", "told"),
+    ("what", "reason"),
     [
+        ("ctrl-c", "^$"),
         ("e-stop", r"^/lab went to e_stop: e-stop pressed$"),
         ("robot", r"^/lab went to fault: measurement is \d+ ms old; expected at most 500 ms"),
         ("adopter", r"^/lab has sent no state for 5 s: .* cut the motor's supply"),
     ],
-    ids=["e-stop", "robot", "adopter"],
+    ids=["ctrl-c", "e-stop", "robot", "adopter"],
 )
 def test_a_session_ends_at_once_with_the_plant_that_is_stopped_or_dies_on_its_way_up_and_the_reason(
-    what: str, told: str, lab: Laboratory, tmp_path: Path
+    what: str, reason: str, lab: Laboratory, tmp_path: Path
 ) -> None:
+    printed = len(lab.adopter.output)
+
     def stop() -> None:
+        if what == "ctrl-c":
+            raise KeyboardInterrupt
         if what == "e-stop":
             assert lab.peer.ask("e_stop").success
         else:
@@ -133,11 +108,15 @@ def test_a_session_ends_at_once_with_the_plant_that_is_stopped_or_dies_on_its_wa
             stop()
             session.orchestrator.wait_for("the end of the move", plant.trajectory_finished, 20.0)
 
-    with pytest.raises(FaultError, match=told):
+    with pytest.raises(KeyboardInterrupt if what == "ctrl-c" else FaultError, match=reason):
         move()
     # What did not die goes on, and a stop stays until somebody takes it back.
     assert (lab.robot.returncode is None) is (what != "robot")
     assert (lab.adopter.returncode is None) is (what != "adopter")
+    if what == "ctrl-c":
+        # It was on its way up by itself: without a command it would go on to upright.
+        disarmed = r"armed_position: following a trajectory\n(?s:.*)\bdisarmed\b"
+        wait_for(lambda: re.search(disarmed, lab.adopter.output[printed:]), 10.0, "the adopted plant to be disarmed")
     if what == "e-stop":
         lab.peer.spin(0.5)
         assert lab.peer.diagnostics["mode"] == "e_stop"
@@ -145,24 +124,14 @@ def test_a_session_ends_at_once_with_the_plant_that_is_stopped_or_dies_on_its_wa
 
 
 def test_a_plant_of_several_joints_is_refused_before_anything_of_it_is_asked(
-    processes: ProcessGroup, domain_id: int, tmp_path: Path
+    processes: ProcessGroup, domain_id: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    at = ["--ros-args", "-r", "__ns:=/lab", "-p", "plant:=acrobot", "-p", "armed_at_start:=false"]
+    at = ["--ros-args", "-r", "__ns:=/lab", "-p", "plant:=acrobot"]
+    at += ["-p", "armed_at_start:=false", "-p", "rate_hz:=100.0"]
     plant = processes.start("pendulum_sim", "simulator", *at)
     plant.wait_for_output(r"\[INFO\].*ready", 60)
-    run = processes.start(
-        "pendulum_bags",
-        "experiment",
-        "thesis",
-        "--out",
-        tmp_path / "run",
-        "--domain",
-        str(domain_id),
-        "--hardware",
-        "ros:/lab",
-        "--yes",
-        alone=True,
-    )
-    assert run.wait(60.0) == 2
-    assert "error: /lab has the joints shoulder, elbow; expected the one of a pendulum, pendulum_joint\n" in run.output
+    words = ["thesis", "--out", str(tmp_path / "run"), "--domain", str(domain_id), "--hardware", "ros:/lab", "--yes"]
+    assert main(words) == 2
+    error = "error: /lab has the joints shoulder, elbow; expected the one of a pendulum, pendulum_joint\n"
+    assert error in capfd.readouterr().err
     assert plant.returncode is None

@@ -579,7 +579,7 @@ def browser() -> Iterator[Any]:
         opened.close()
 
 
-@pytest.fixture(params=WIDTHS)
+@pytest.fixture(scope="module", params=WIDTHS)
 def visit(request: pytest.FixtureRequest, browser: Any, page: Path) -> Iterator[Any]:
     context = browser.new_context(viewport={"width": WIDTHS[request.param], "height": 900}, offline=True)
     opened = context.new_page()
