@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +14,7 @@ from rich.progress import TextColumn, TimeRemainingColumn
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counting_bar
-from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main, typed_options
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, command_line, typed_options
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
@@ -38,10 +37,7 @@ _TAUGHT_OFFSET = 1e-3
 """What differs where a teacher is imitated, unless it is given: a swing-up's gains are high, and where plant and state
 are poorly known there is no single command to learn."""
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command()
 def train(
     context: typer.Context,
     out: Annotated[Path, out_option("Policy file (.npz); it must be new.")],
@@ -186,4 +182,4 @@ def _sentence(measured: Mapping[str, Any]) -> str:
     return f"{text}; {gave_up} left the states that training visited" if gave_up else text
 
 
-main = partial(cli_main, app, name="python -m pendulum_learning train")
+main = command_line(train, "python -m pendulum_learning train")

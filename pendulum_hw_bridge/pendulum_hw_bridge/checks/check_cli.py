@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +20,7 @@ from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.port.clocks import WallClock
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism, load_mechanism
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.graph import ParameterArgument
 from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
@@ -33,10 +32,7 @@ EXIT_NOT_READY = 1
 EXIT_BUSY = 3
 """Exit code if this computer was too busy to judge the actuator, and nothing else failed."""
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command()
 def check(
     context: typer.Context,
     lab: Annotated[Path | None, typer.Option(help="Lab file; explicit options take precedence.")] = None,
@@ -155,4 +151,4 @@ def _print(found: Checklist) -> None:
         )
 
 
-main = partial(cli_main, app, name="python -m pendulum_hw_bridge check", takes_ros_arguments=True)
+main = command_line(check, "python -m pendulum_hw_bridge check", takes_ros_arguments=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -13,15 +12,12 @@ from pendulum_hw_bridge.backends.hebi_log import read_hebilog, to_joint
 from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.lab_file import load_lab
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import out_option
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command()
 def convert(
     log: Annotated[Path, typer.Argument(help="The .hebilog file.")],
     out: Annotated[Path | None, out_option("CSV file to write. Default: next to the log.")] = None,
@@ -53,4 +49,4 @@ def convert(
     print(f"{target}: {len(kept['time'])} records, {kept['time'][-1]:.2f} s, {len(kept) - 1} quantities")
 
 
-main = partial(cli_main, app, name="python -m pendulum_hw_bridge convert")
+main = command_line(convert, "python -m pendulum_hw_bridge convert")

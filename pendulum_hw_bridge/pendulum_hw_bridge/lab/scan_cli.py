@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,7 +16,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.parameters import validate
 from pendulum_msgs_py.plants.lab_file import load_lab
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
@@ -26,10 +25,7 @@ __all__ = ["main"]
 EXIT_NONE_CHOSEN = 1
 """Exit code if not exactly one module matches."""
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command()
 def scan(
     lab: Annotated[Path | None, typer.Option(help="Lab file that says which module is meant.")] = None,
     backend: Annotated[str | None, typer.Option(help="hebi, or emulator_process for an emulator.")] = None,
@@ -146,4 +142,4 @@ def _print(modules: list[ModuleRecord], chosen: ModuleRecord | None, reason: str
         console.print(reason, style="bold red", highlight=False)
 
 
-main = partial(cli_main, app, name="python -m pendulum_hw_bridge scan")
+main = command_line(scan, "python -m pendulum_hw_bridge scan")

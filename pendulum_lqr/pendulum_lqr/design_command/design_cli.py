@@ -43,11 +43,11 @@ from pendulum_msgs_py.plants.plant_parameters import (
     PlantParameters,
     load_mechanism,
 )
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import make_console
 
-__all__ = ["THESIS_CHOICE", "THESIS_WEIGHTS", "app", "main", "read_diagonal"]
+__all__ = ["THESIS_CHOICE", "THESIS_WEIGHTS", "main", "read_diagonal"]
 
 THESIS_WEIGHTS: tuple[tuple[tuple[float, float], float], ...] = (
     ((1.0, 0.01), 0.1),
@@ -59,10 +59,7 @@ THESIS_WEIGHTS: tuple[tuple[tuple[float, float], float], ...] = (
 THESIS_CHOICE = 3
 """Combination that the thesis runs on its hardware."""
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command()
 def design(
     preset: Annotated[
         str, typer.Option(help=f"Plant: {PRESET_NAMES}; of several joints: {', '.join(MECHANISM_PRESETS)}.")
@@ -340,6 +337,4 @@ def _save(plant: PlantParameters, table: _Table, effort_limit: float, folder: Pa
     return paths
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the design command and return the exit code."""
-    return cli_main(app, argv, name="python -m pendulum_lqr design")
+main = command_line(design, "python -m pendulum_lqr design")

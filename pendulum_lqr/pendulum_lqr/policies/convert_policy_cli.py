@@ -2,27 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.programs.executables import cli_main, typed_options
+from pendulum_msgs_py.programs.executables import command_line, typed_options
 from pendulum_msgs_py.programs.options import out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
     from pendulum_lqr.policies.policy_import import ActorSpec
 
-__all__ = ["app", "main"]
+__all__ = ["main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 _OF_IMPORT = ("plant", "period", "observation", "history", "velocity_scale", "velocity_box", "effort_limit")
 
 
-@app.command()
 def convert_policy(
     context: typer.Context,
     source: Annotated[Path, typer.Argument(help="Policy file (.npz), or an archive of Stable-Baselines3 (.zip).")],
@@ -116,6 +113,4 @@ def _import(source: Path, out: Path, spec: ActorSpec) -> str:
     )
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the conversion and return the exit code."""
-    return cli_main(app, argv, name="python -m pendulum_lqr convert_policy")
+main = command_line(convert_policy, "python -m pendulum_lqr convert_policy")

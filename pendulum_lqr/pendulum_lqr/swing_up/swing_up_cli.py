@@ -6,7 +6,6 @@ from __future__ import annotations
 import pendulum_msgs_py.programs.one_thread  # noqa: F401  # before anything that imports numpy
 # isort: on
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -16,17 +15,15 @@ from pendulum_lqr.swing_up.ilqr import IlqrWeights, require_several_joints
 from pendulum_msgs_py.atomic_write import writing
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.programs.counted_progress import counting_bar
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
-__all__ = ["app", "main"]
+__all__ = ["main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 _WEIGHTS = "0.15,0.0447,0.143,0.00137,0.00655,10"
 
 
-@app.command()
 def swing_up(
     preset: Annotated[str, typer.Option(help="Preset or plant file of several joints.")] = "acrobot_frictionless",
     weights: Annotated[
@@ -67,6 +64,4 @@ def swing_up(
     console.print(f"trajectory {output}", soft_wrap=True)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the search and return the exit code."""
-    return cli_main(app, argv, name="python -m pendulum_lqr swing_up")
+main = command_line(swing_up, "python -m pendulum_lqr swing_up")

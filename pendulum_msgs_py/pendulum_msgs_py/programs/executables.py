@@ -14,6 +14,7 @@ import re
 import sys
 from collections.abc import Callable, Collection, Sequence
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,6 +32,7 @@ __all__ = [
     "EXIT_USAGE",
     "answer_of_dispatcher",
     "cli_main",
+    "command_line",
     "is_exhaustion",
     "is_installed",
     "print_completion",
@@ -155,6 +157,17 @@ def split_ros_arguments(arguments: Sequence[str]) -> tuple[list[str], list[str]]
     """Return a program's own arguments, and those from ``--ros-args`` on."""
     split = arguments.index("--ros-args") if "--ros-args" in arguments else len(arguments)
     return list(arguments[:split]), list(arguments[split:])
+
+
+def command_line(
+    command: Callable[..., int | None], name: str, *, takes_ros_arguments: bool = False, **of_typer: Any
+) -> Callable[..., int]:
+    """Return the ``main`` of a program that is one command, by :func:`cli_main`."""
+    import typer
+
+    app = typer.Typer(add_completion=False, rich_markup_mode=None)
+    app.command(**of_typer)(command)
+    return partial(cli_main, app, name=name, takes_ros_arguments=takes_ros_arguments)
 
 
 def cli_main(

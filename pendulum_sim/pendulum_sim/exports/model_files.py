@@ -25,7 +25,7 @@ from pendulum_msgs_py.mechanisms.mechanism import STANDARD_GRAVITY
 from pendulum_msgs_py.plants.equilibrium import torque_gain, total_damping
 from pendulum_msgs_py.plants.joint_parameters import JointParameters, SeriesElasticParameters
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import out_option
 from pendulum_sim.exports.ros2_control_tags import add_ros2_control
 from pendulum_sim.exports.xml_files import add, document_text, lateness, number, safe_name
@@ -269,10 +269,6 @@ def _vector(values: Sequence[float]) -> str:
     return " ".join(number(value) for value in values)
 
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
-
-
-@app.command()
 def export(
     plant: Annotated[str, typer.Option(help="Preset or path of a plant file.")] = "thesis",
     kind: Annotated[str, typer.Option("--format", help="urdf or mjcf.")] = "urdf",
@@ -300,6 +296,4 @@ def export(
         write_atomically(output, text)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line."""
-    return cli_main(app, argv, name="python -m pendulum_sim export_model")
+main = command_line(export, "python -m pendulum_sim export_model")

@@ -10,15 +10,12 @@ from typing import Annotated
 import typer
 
 from pendulum_msgs_py.plants.plant_parameters import load_plant
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import Json, out_option
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command()
 def phase_plot(
     plant: Annotated[str, typer.Option(help="Preset or path of a plant file.")] = "thesis",
     torque: Annotated[float, typer.Option(help="Constant torque u_0 [N m].")] = 0.0,
@@ -50,6 +47,4 @@ def phase_plot(
     console.print(f"figure: {path}", soft_wrap=True)
 
 
-def main(argv: list[str] | None = None) -> int:
-    """Run the command line."""
-    return cli_main(app, argv, name="python -m pendulum_sim phase_plot")
+main = command_line(phase_plot, "python -m pendulum_sim phase_plot")

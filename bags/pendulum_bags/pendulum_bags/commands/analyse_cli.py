@@ -16,16 +16,15 @@ from pendulum_bags.commands.recording_options import Dt, Mappings, Start, Stop, 
 from pendulum_bags.figures.terminal_table import number_table
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counted_progress
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 if TYPE_CHECKING:
     from pendulum_bags.analyse.bag_table import Table as BagTable
 
-__all__ = ["app", "main"]
+__all__ = ["main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 _SHOWN = {
     "seed": "seed",
@@ -49,7 +48,6 @@ def _named(*, of_runs: bool) -> str:
     return ", ".join(name for name, question in QUESTIONS.items() if question.of_runs is of_runs)
 
 
-@app.command(epilog="Example: python -m pendulum_bags analyse bags/examples --ask metrics,timing --out /tmp/analysed")
 def analyse(
     folders: Annotated[list[Path], typer.Argument(help="Folders with bags below them, or recordings of any format.")],
     ask: Annotated[
@@ -72,7 +70,10 @@ def analyse(
     stop: Stop = None,
     json_output: Json = False,
 ) -> None:
-    """Ask many recordings the same questions: metrics, timing, identified parameters, equivalence; one table."""
+    """Ask many recordings the same questions: metrics, timing, identified parameters, equivalence; one table.
+
+    Example: python -m pendulum_bags analyse bags/examples --ask metrics,timing --out /tmp/analysed
+    """
     from pendulum_bags.analyse.bag_table import analyse_bags, find_pieces
     from pendulum_bags.studies.chunks import cluster_client
 
@@ -117,4 +118,4 @@ def _cell(value: Any) -> str:
     return "–" if value is None else f"{value:.4g}" if isinstance(value, float) else escape(str(value))
 
 
-main = partial(cli_main, app, name="python -m pendulum_bags analyse")
+main = command_line(analyse, "python -m pendulum_bags analyse")

@@ -23,7 +23,7 @@ from pendulum_bags.commands.recording_options import (
 )
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import json_text
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import Json, out_option
 
 if TYPE_CHECKING:
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 Paths = Annotated[
     list[Path],
@@ -80,7 +79,6 @@ LayersOption = Annotated[
 ]
 
 
-@app.command()
 def compare(
     paths: Paths,
     margin: MarginOption = None,
@@ -271,4 +269,4 @@ def _print(console: Console, result: Comparison, content: dict[str, Any]) -> Non
         print_tests(console, result)
 
 
-main = partial(cli_main, app, name="python -m pendulum_bags compare")
+main = command_line(compare, "python -m pendulum_bags compare")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -12,16 +11,13 @@ import typer
 from pendulum_bags.arrays import Array
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import json_text
-from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, command_line
 from pendulum_msgs_py.programs.options import Json, RunningDomain, out_option
 from pendulum_msgs_py.programs.typed_commands import as_typed
 
-__all__ = ["app", "main"]
-
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
+__all__ = ["main"]
 
 
-@app.command()
 def excite(
     plant: Annotated[str, typer.Option(help="Prior guess: preset or plant file.")] = "dfki",
     parameters: Annotated[
@@ -184,4 +180,4 @@ def _peaks(motion: Array) -> list[float]:
     return [float(value) for value in np.atleast_1d(np.abs(motion).max(axis=0))]
 
 
-main = partial(cli_main, app, name="python -m pendulum_bags excite")
+main = command_line(excite, "python -m pendulum_bags excite")

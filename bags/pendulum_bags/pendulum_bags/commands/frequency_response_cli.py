@@ -31,7 +31,7 @@ from pendulum_bags.experiments.plant_options import (
 )
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.json_values import json_text
-from pendulum_msgs_py.programs.executables import cli_main, typed_options
+from pendulum_msgs_py.programs.executables import command_line, typed_options
 from pendulum_msgs_py.programs.options import Domain, Json, Storage, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 
 __all__ = ["experiment", "main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
 Design = Annotated[
     list[str] | None,
@@ -57,7 +56,6 @@ GapMargin = Annotated[
 ]
 
 
-@app.command()
 def frequency_response(
     context: typer.Context,
     bags: Annotated[
@@ -251,4 +249,4 @@ def _extent(facts: Mapping[str, Any]) -> str:
     return f"largest angle {facts['largest_angle_rad']:.3f} rad, largest torque {facts['largest_torque_nm']:.2f} N m"
 
 
-main = partial(cli_main, app, name="python -m pendulum_bags frequency_response")
+main = command_line(frequency_response, "python -m pendulum_bags frequency_response")

@@ -7,7 +7,6 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -15,13 +14,13 @@ import typer
 from pendulum_msgs_py.contract import names
 from pendulum_msgs_py.contract.trajectory import thesis_ramp
 from pendulum_msgs_py.errors import FaultError, ParameterError
-from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, cli_main
+from pendulum_msgs_py.programs.executables import EXIT_INTERRUPTED, command_line
 from pendulum_msgs_py.programs.options import RunningDomain
 
 if TYPE_CHECKING:
     from pendulum_bags.experiments.orchestrator_node import PlantClient
 
-__all__ = ["app", "main"]
+__all__ = ["main"]
 
 _STOPS = {
     "stop": (names.E_STOP, "e-stop, latched; end it with: move reset"),
@@ -33,13 +32,7 @@ _PATIENCE = 20.0
 _SOON = 3.0
 """Time after which a user reads that an e-stop is not confirmed yet [s]."""
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command(
-    epilog="Example: python -m pendulum_bags move upright --namespace /sim",
-    context_settings={"ignore_unknown_options": True},
-)
 def move(
     goal: Annotated[str, typer.Argument(help="upright, down, an angle [rad]; or stop (latches the e-stop), reset.")],
     namespace: Annotated[str, typer.Option(help="Of the plant.")] = "/sim",
@@ -56,6 +49,8 @@ def move(
     network and this computer: on a real machine use the motion stop first. Where the plant does not confirm it, the
     exit code is 2. A request that reached a suspended program acts when it continues; its plant is in `fault` then,
     and arms only on request.
+
+    Example: python -m pendulum_bags move upright --namespace /sim
     """
     from pendulum_bags.experiments.domain import check_domain
     from pendulum_bags.experiments.graph_plant import find_plant
@@ -157,4 +152,4 @@ def _move(plant: PlantClient, goal: str | float, *, controlled: bool, control: b
         print(f"{space}: upright; held under position control", flush=True)
 
 
-main = partial(cli_main, app, name="python -m pendulum_bags move")
+main = command_line(move, "python -m pendulum_bags move", context_settings={"ignore_unknown_options": True})

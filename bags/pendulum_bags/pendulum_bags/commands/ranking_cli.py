@@ -19,16 +19,13 @@ from pendulum_bags.commands.recording_options import (
     show_guesses,
 )
 from pendulum_msgs_py.json_values import json_text
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command()
 def ranking(
     context: typer.Context,
     paths: Annotated[
@@ -117,4 +114,4 @@ def ranking(
         console.print(f"\npage    {page}", soft_wrap=True)
 
 
-main = partial(cli_main, app, name="python -m pendulum_bags ranking")
+main = command_line(ranking, "python -m pendulum_bags ranking")

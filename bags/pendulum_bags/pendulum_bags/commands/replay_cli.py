@@ -13,7 +13,7 @@ from pendulum_bags.commands.recording_options import Dt, Mappings, Topics, Write
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.plant_parameters import PRESET_NAMES, is_mechanism
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
@@ -24,10 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command()
 def replay(
     context: typer.Context,
     recording: Annotated[Path, typer.Argument(help="Recording of any format.")],
@@ -140,4 +137,4 @@ def _print(result: InputReplay | ControllerReplay | JointReplay, content: dict[s
     console.print(result.sentence(), highlight=False, markup=False)
 
 
-main = partial(cli_main, app, name="python -m pendulum_bags replay")
+main = command_line(replay, "python -m pendulum_bags replay")

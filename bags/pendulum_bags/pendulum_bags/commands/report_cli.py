@@ -23,7 +23,7 @@ from pendulum_bags.commands.recording_options import (
     show_guesses,
 )
 from pendulum_msgs_py.errors import BagError, DataError
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import out_option
 from pendulum_msgs_py.programs.terminal import make_console
 from pendulum_rosbag.reader.open_source import is_bag_folder, is_storage_file
@@ -34,10 +34,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command()
 def report(
     context: typer.Context,
     folders: Annotated[
@@ -185,4 +182,4 @@ def _summary(folder: Path) -> dict[str, object] | None:
     return {key: content[key] for key in shown if key in content} if isinstance(content, dict) else None
 
 
-main = partial(cli_main, app, name="python -m pendulum_bags report")
+main = command_line(report, "python -m pendulum_bags report")

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pendulum_console.console.security import is_loopback
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 
 if TYPE_CHECKING:
     from pendulum_console.live.foxglove_node import LiveNode
@@ -20,13 +19,7 @@ __all__ = ["LAYOUT", "main"]
 
 LAYOUT = Path(__file__).parents[1] / "live" / "foxglove_layout.json"
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command(
-    epilog="Example: python -m pendulum_console foxglove --port 8765. ROS arguments follow --ros-args; the ROS "
-    "domain is that of ROS_DOMAIN_ID."
-)
 def foxglove(
     context: typer.Context,
     host: Annotated[
@@ -38,7 +31,11 @@ def foxglove(
         typer.Option(help="Let pages of this address in, too, such as https://lichtblick.example; may be repeated."),
     ] = None,
 ) -> int:
-    """Serve topics, parameters and services to Foxglove and Lichtblick until Ctrl-C."""
+    """Serve topics, parameters and services to Foxglove and Lichtblick until Ctrl-C.
+
+    Example: python -m pendulum_console foxglove --port 8765. ROS arguments follow --ros-args; the ROS domain is that
+    of ROS_DOMAIN_ID.
+    """
     from pendulum_console.live.foxglove_node import LiveNode, LiveOptions
     from pendulum_msgs_py.ros.runner import run_node
 
@@ -55,4 +52,4 @@ def foxglove(
     return run_node(make, list(context.obj), program="pendulum_console foxglove", description="Live in Foxglove.")
 
 
-main = partial(cli_main, app, name="python -m pendulum_console foxglove", takes_ros_arguments=True)
+main = command_line(foxglove, "python -m pendulum_console foxglove", takes_ros_arguments=True)

@@ -7,7 +7,6 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,7 +21,7 @@ from std_srvs.srv import SetBool, Trigger
 from pendulum_msgs_py.contract.names import CLOCK
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.parameters import ParameterSpec
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.ros.convert import class_of, stamp_to_message
 from pendulum_msgs_py.ros.parameters import NodeParameters
 from pendulum_msgs_py.ros.runner import run_node
@@ -241,13 +240,6 @@ def _recorded_qos(text: str) -> QoSProfile:
     )
 
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
-
-
-@app.command(
-    epilog="Example: python -m pendulum_rosbag play runs/today/sim -t /sim/joint_states --remap "
-    "/sim/joint_states:=/joint_states --rate 0.5. ROS arguments follow --ros-args."
-)
 def play(
     context: typer.Context,
     bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
@@ -261,7 +253,11 @@ def play(
     paused: Annotated[bool, typer.Option("--paused", help="Begin when ~/pause is called with false.")] = False,
     clock_rate: Annotated[float, typer.Option(help="Messages on /clock a second; 0 for none.")] = 100.0,
 ) -> int:
-    """Publish the topics of a bag again, at recorded times, with /clock."""
+    """Publish the topics of a bag again, at recorded times, with /clock.
+
+    Example: python -m pendulum_rosbag play runs/today/sim -t /sim/joint_states --remap
+    /sim/joint_states:=/joint_states --rate 0.5. ROS arguments follow --ros-args.
+    """
     pairs = []
     for text in remap or []:
         old, separator, new = text.partition(":=")
@@ -286,4 +282,4 @@ def play(
     )
 
 
-main = partial(cli_main, app, name="python -m pendulum_rosbag play", takes_ros_arguments=True)
+main = command_line(play, "python -m pendulum_rosbag play", takes_ros_arguments=True)

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import sys
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import out_option
 from pendulum_rosbag.reader import read_bag
 from pendulum_rosbag.reader.lerobot import DEFAULT_TASK, export_lerobot
@@ -18,13 +17,7 @@ from pendulum_rosbag.reader.tables import LEROBOT, export_bag, require_pyarrow
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command(
-    epilog="Example: python -m pendulum_rosbag export runs/today/sim -o today_sim --format csv; or "
-    "python -m pendulum_rosbag export runs/today/sim runs/today/hw -o dataset --format lerobot"
-)
 def export(
     bags: Annotated[
         list[Path], typer.Argument(help="Folder of a bag, or one .mcap or .db3 file; several for lerobot.")
@@ -38,7 +31,11 @@ def export(
     ] = None,
     task: Annotated[str, typer.Option(help="lerobot: what was to be done.")] = DEFAULT_TASK,
 ) -> int:
-    """Write each topic of a bag to a table of its own (SI units, times in nanoseconds), or bags as one dataset."""
+    """Write each topic of a bag to a table of its own (SI units, times in nanoseconds), or bags as one dataset.
+
+    Example: python -m pendulum_rosbag export runs/today/sim -o today_sim --format csv; or python -m pendulum_rosbag
+    export runs/today/sim runs/today/hw -o dataset --format lerobot
+    """
     if format == LEROBOT:
         require_pyarrow(format)
         files = export_lerobot([read_bag(bag, topics) for bag in bags], output, fps=fps, task=task)
@@ -58,4 +55,4 @@ def export(
     return 0
 
 
-main = partial(cli_main, app, name="python -m pendulum_rosbag export")
+main = command_line(export, "python -m pendulum_rosbag export")

@@ -5,14 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from pendulum_msgs_py.json_values import json_text
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 from pendulum_rosbag.reader import read_bag
@@ -20,14 +19,14 @@ from pendulum_rosbag.reader.statistics import BagStatistics, bag_statistics
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command(epilog="Example: python -m pendulum_rosbag info runs/today/sim --json")
 def info(
     bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")], as_json: Json = False
 ) -> int:
-    """Print whether a bag is good: rates, gaps, jitter, latencies between topics, duplicates and clock jumps."""
+    """Print whether a bag is good: rates, gaps, jitter, latencies between topics, duplicates and clock jumps.
+
+    Example: python -m pendulum_rosbag info runs/today/sim --json
+    """
     opened = read_bag(bag, verify=True)
     statistics = bag_statistics(opened)
     if as_json:
@@ -105,4 +104,4 @@ def _alarm(count: int) -> str:
     return f"[bold red]{count}[/]" if count else "0"
 
 
-main = partial(cli_main, app, name="python -m pendulum_rosbag info")
+main = command_line(info, "python -m pendulum_rosbag info")

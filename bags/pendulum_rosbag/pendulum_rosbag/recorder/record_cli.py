@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pendulum_msgs_py.errors import BagError
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import out_option
 from pendulum_rosbag.recorder.options import RecorderOptions, read_metadata
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command(
-    epilog="Example: python -m pendulum_rosbag record -o runs/today --regex '^/(sim|hw)/' --compression zstd. "
-    "ROS arguments follow --ros-args."
-)
 def record(
     context: typer.Context,
     output: Annotated[Path, out_option("Folder of the bag; it must not exist.")],
@@ -47,7 +40,11 @@ def record(
         typer.Option(help="Keep so much in memory [s], and write a bag of it at each fault and e-stop; 0 records all."),
     ] = 0.0,
 ) -> int:
-    """Record topics to a rosbag2 folder that is complete and readable at every instant."""
+    """Record topics to a rosbag2 folder that is complete and readable at every instant.
+
+    Example: python -m pendulum_rosbag record -o runs/today --regex '^/(sim|hw)/' --compression zstd. ROS arguments
+    follow --ros-args.
+    """
     options = RecorderOptions(
         output,
         tuple(topics or ()),
@@ -78,4 +75,4 @@ def record(
     )
 
 
-main = partial(cli_main, app, name="python -m pendulum_rosbag record", takes_ros_arguments=True)
+main = command_line(record, "python -m pendulum_rosbag record", takes_ros_arguments=True)

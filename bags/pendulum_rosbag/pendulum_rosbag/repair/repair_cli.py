@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pendulum_msgs_py.json_values import json_text
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_rosbag.repair.repair import repair_bag
 
 __all__ = ["main"]
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command(epilog="Example: python -m pendulum_rosbag repair runs/today/sim")
 def repair(
     bag: Annotated[Path, typer.Argument(help="Folder of the bag, or one .mcap or .db3 file.")],
     output: Annotated[
@@ -28,7 +24,10 @@ def repair(
     force: Annotated[bool, typer.Option("--force", help="Rewrite a sound bag, too.")] = False,
     as_json: Json = False,
 ) -> int:
-    """Save all whole messages of a broken bag to a sound one; the broken one is kept as BAG.broken."""
+    """Save all whole messages of a broken bag to a sound one; the broken one is kept as BAG.broken.
+
+    Example: python -m pendulum_rosbag repair runs/today/sim
+    """
     report = repair_bag(bag, output, force=force)
     if as_json:
         print(json_text(dataclasses.asdict(report)))
@@ -43,4 +42,4 @@ def repair(
     return 0
 
 
-main = partial(cli_main, app, name="python -m pendulum_rosbag repair")
+main = command_line(repair, "python -m pendulum_rosbag repair")
