@@ -16,6 +16,16 @@ from typing import Any
 import numpy as np
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.recordings.column_names import (
+    ANGLES,
+    WORDS,
+    Candidate,
+    candidate_of,
+    is_command,
+    slides,
+    tokens_of,
+    words_of,
+)
 from pendulum_bags.recordings.columns import Columns
 from pendulum_bags.recordings.mapping import Rules
 from pendulum_bags.recordings.physics import (
@@ -31,51 +41,10 @@ from pendulum_bags.recordings.physics import (
 from pendulum_bags.recordings.units import INPUTS, UNITS, known_unit, quantity_of
 from pendulum_msgs_py.errors import DataError
 
-__all__ = ["Guess", "guess_rules", "is_of"]
+__all__ = ["Guess", "guess_rules"]
 
-_WORDS: Mapping[str, frozenset[str]] = {
-    "time": frozenset({"t", "time", "times", "timestamp", "timestamps", "stamp", "tout", "elapsed", "zeit", "sec"}),
-    "velocity": frozenset({"vel", "velocity", "speed", "omega", "dot", "qd", "dq", "angvel", "geschwindigkeit"}),
-    "angle": frozenset(
-        {"theta", "th", "angle", "angles", "alpha", "phi", "psi", "beta", "pos", "position", "q", "qpos", "winkel",
-         "angular", "encoder", "y"}
-    ),
-    "place": frozenset({"x", "cart", "distance", "place", "slider"}),
-    "input": frozenset(
-        {"u", "torque", "tau", "effort", "voltage", "volt", "volts", "pwm", "input", "command", "cmd", "action", "duty",
-         "vm", "current", "control", "motor", "force", "actuator", "moment"}
-    ),
-    "reference": frozenset({"ref", "reference", "target", "desired", "des", "setpoint", "goal", "sp", "soll"}),
-    "disturbance": frozenset({"disturbance", "dist", "perturbation", "pert", "noise"}),
-}  # fmt: skip
-_NEVER = frozenset(
-    {"raw", "err", "error", "squared", "cos", "sin", "latency", "index", "frame", "fric", "friction", "acc", "accel",
-     "acceleration", "ddot", "tf", "rotation", "translation", "quaternion", "orientation", "layout", "parameter",
-     "events", "imu", "temp", "temperature", "saturation", "feedforward", "offset", "episode", "reward", "done", "id",
-     "count", "covariance", "delta", "frequency", "log"}
-)  # fmt: skip
-_WEAK = frozenset({"y", "q", "x", "th", "control", "motor", "current", "encoder", "angular", "action", "force", "cart"})
-"""Words that mean something else where a plainer one is there."""
-_ANGLES = _WORDS["angle"] - _WEAK - {"pos", "position", "qpos"}
-"""Words that only an angle has."""
 _LEAST_MISFIT = 0.2
 """Share of the acceleration that radians leave unexplained where the angle is in degrees."""
-_NAMING = frozenset({"theta", "alpha", "phi", "psi", "beta", "x", "cart", "distance", "angle", "slider"})
-"""Words that are the name of a joint, too."""
-_MEASURED, _FILTERED = (
-    frozenset({"meas", "measured", "actual", "applied"}),
-    frozenset({"filt", "filtered", "est", "estimated"}),
-)
-_COMMANDED = frozenset({"con", "cmd", "command", "commanded", "controller", "u"})
-_PLAIN = frozenset(
-    {"joint", "joints", "states", "state", "observation", "values", "value", "signals", "data", "sim", "hw"}
-)
-_UNIT_WORDS = {
-    "deg": "deg", "degrees": "deg", "rad": "rad", "ms": "ms", "us": "us", "ns": "ns", "rpm": "rpm", "nm": "N m",
-    "volt": "V", "volts": "V", "voltage": "V", "v": "V", "vm": "V", "torque": "N m", "tau": "N m", "effort": "N m",
-    "moment": "N m", "pwm": "-", "duty": "-",
-}  # fmt: skip
-_TOKENS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_]+")
 _MOST_PAIRS = 24
 _MOST_ROWS = 400_000
 """Rows that a guess is tested on."""
@@ -101,24 +70,6 @@ class Guess:
 
 
 @dataclass
-class _Candidate:
-    """A column with the role that its name proposes."""
-
-    name: str
-    role: str
-    stem: str
-    rank: int
-    weak: bool
-    unit: str
-    label: str
-    chosen: bool = False
-
-    @property
-    def how(self) -> str:
-        return "as given" if self.chosen else "by its name"
-
-
-@dataclass
 class _Found:
     """A joint that was found."""
 
@@ -130,11 +81,6 @@ class _Found:
 
     def of(self, quantity: str) -> str:
         return f"{quantity} of {self.name}" if self.name else quantity
-
-
-def is_of(column: str, place: str) -> bool:
-    """Return whether a column is one of a given name, or of a topic or path of that name."""
-    return column == place or column.startswith((f"{place}/", f"{place}.", f"{place}["))
 
 
 def guess_rules(
@@ -169,7 +115,11 @@ class _Guesser:
     def __init__(self, columns: Columns, period: float | None, only: dict[str, str]) -> None:
         self.columns, self.only, self.period = columns, only, period
         self.guesses: list[Guess] = []
-        self.candidates = [one for name in columns.columns if (one := self._candidate(name)) is not None]
+        self.candidates = [
+            one
+            for name, column in columns.columns.items()
+            if (one := candidate_of(name, column.unit, self.only)) is not None
+        ]
 
     def rules(self) -> tuple[Rules, list[Guess]]:
         time = self._time()
@@ -204,71 +154,6 @@ class _Guesser:
         still = (one.name for one in self.candidates if not moves(self.columns.values(one.name)))
         return any(moves(whole.values(name)) for name in still)
 
-    # -- names -----------------------------------------------------------------------------------------------------
-
-    def _candidate(self, name: str) -> _Candidate | None:
-        for role, start in self.only.items():
-            if is_of(name, start):
-                wanted = role
-                break
-        else:
-            wanted = ""
-        words = _tokens(name)
-        present = {word.casefold() for word in words}
-        stated = self.columns.columns[name].unit
-        if wanted == "" and present & _NEVER:
-            return None
-        role = self._role(words, present, stated) if wanted in {"", "states"} else wanted
-        weak = not (present - _WEAK) & _WORDS.get(_WORD_OF.get(role, role), frozenset())
-        if weak and not wanted and re.search(r"\[\d+\]$", name):
-            return None  # rows of an array such as x or y are states, of which the data say more
-        if not role or (not wanted and self._is_taken(role)) or (wanted == "states" and role not in _STATES):
-            return None
-        naming = [word for word in words if self._names_joint(word.casefold())]
-        stem = "_".join(naming)
-        measured, filtered = bool(present & _MEASURED), bool(present & _FILTERED)
-        rank = 0 if measured else 2 if filtered else 3 if role == "input" and present & {"con", "commanded"} else 1
-        unit = stated or next((_UNIT_WORDS[word.casefold()] for word in words if word.casefold() in _UNIT_WORDS), "")
-        if role == "velocity" and not stated and unit in UNITS["angle"]:
-            unit += "/s"  # as of omega_rad_s
-        return _Candidate(
-            name, role, stem.casefold(), rank, weak and not wanted, unit, _label(name, stem), bool(wanted)
-        )
-
-    def _is_taken(self, role: str) -> bool:
-        """Return whether the caller chose another column for a role."""
-        return role in self.only or (role in _STATES and "states" in self.only)
-
-    def _role(self, words: Sequence[str], present: set[str], stated: str) -> str:
-        quantity = quantity_of(stated)
-        if words and words[-1].casefold() in _WORDS["time"] and len(words) > 1:
-            return "time"
-        if quantity in {"velocity", "speed"}:
-            return "velocity"
-        has = {role for role, known in _WORDS.items() if present & known}
-        if "disturbance" in has:
-            return "disturbance"
-        if "velocity" in has or _is_derivative(words):
-            return "" if "reference" in has else "velocity"
-        if "reference" in has:
-            return "reference"
-        if quantity == "time" or ("time" in has and not has - {"time"}):
-            return "time"
-        if quantity in INPUTS and quantity != "angle":
-            return "input"
-        if quantity in {"angle", "place"}:
-            return "input" if "input" in has - {"angle"} and not has & {"angle", "place"} else "position"
-        if "Q" in words and not present & {"theta", "angle", "position"}:
-            return "input"
-        if has & {"angle", "place"} and not (present & {"effort", "torque", "tau"}):
-            return "position"
-        return "input" if "input" in has else "time" if "time" in has else ""
-
-    @staticmethod
-    def _names_joint(word: str) -> bool:
-        known = set().union(*_WORDS.values()) | _MEASURED | _FILTERED | _COMMANDED | _PLAIN | {"d", "dot"}
-        return word in _NAMING or (word not in known and word not in _UNIT_WORDS)
-
     # -- time ------------------------------------------------------------------------------------------------------
 
     def _time(self) -> dict[str, Any]:
@@ -282,7 +167,7 @@ class _Guesser:
             return {"own": True}
         named = [one.name for one in self.candidates if one.role == "time"]
         # A plain name goes before one inside a path.
-        named.sort(key=lambda name: (len(_tokens(name)), name))
+        named.sort(key=lambda name: (len(tokens_of(name)), name))
         names = [name for name in named if _increases(self.columns.values(name))]
         how = "by its name; it increases"
         if not names and not self.columns.named:
@@ -309,7 +194,7 @@ class _Guesser:
     def _time_section(self, name: str, how: str) -> dict[str, Any]:
         column = self.columns.columns[name]
         # Not the name of a struct: `s.t` says nothing of seconds.
-        words = map(known_unit, _tokens(re.split(r"[/.]", name)[-1]))
+        words = map(known_unit, tokens_of(re.split(r"[/.]", name)[-1]))
         stated = column.unit or next((word for word in words if word in UNITS["time"]), "")
         values = self.columns.values(name)
         step = float(np.median(np.diff(values[np.isfinite(values)])))
@@ -330,10 +215,10 @@ class _Guesser:
     def _joints(self) -> list[_Found]:
         found = [one for one in self.candidates if one.role == "position"]
         if any(not one.weak for one in found):
-            places = _WORDS["place"]
+            places = WORDS["place"]
             found = [one for one in found if not one.weak or set(one.label.casefold().split("_")) & places]
         still = ""
-        chosen: dict[str, _Candidate] = {}
+        chosen: dict[str, Candidate] = {}
         for one in sorted(found, key=lambda one: one.rank):
             values = self.columns.values(one.name)
             if one.stem in chosen:
@@ -385,7 +270,7 @@ class _Guesser:
                 used |= {one, other}
                 how = f"{other} is its derivative (correlation {alike:.3f})"
                 joints.append(self._joint(one, one, one, "", how))
-                self.candidates.append(_Candidate(other, "velocity", one, 0, False, "", one))
+                self.candidates.append(Candidate(other, "velocity", one, 0, False, "", one))
         if joints:
             order = list(self.columns.columns)
             return sorted(joints, key=lambda joint: order.index(joint.position))
@@ -443,10 +328,10 @@ class _Guesser:
         """Take the velocity that the data confirm, and the units and sign that they give."""
         section = joint.sections["position"]
         how = joint.rows[0].how
-        if not section["unit"] and _slides(joint.position, alone=alone):
+        if not section["unit"] and slides(joint.position, alone=alone):
             section["unit"], how = "m", f"{how}; {_ASSUMED_PLACE}"
         tried: list[str] = []
-        best: tuple[bool, float, _Candidate, float, Array, Array] | None = None
+        best: tuple[bool, float, Candidate, float, Array, Array] | None = None
         for one in (one for one in self.candidates if one.role == "velocity"):
             shared = self._together(joint.position, one.name)
             if shared is None:
@@ -488,7 +373,7 @@ class _Guesser:
         section["unit"] = section["unit"] or wanted
         if why:
             how += f"; {section['unit']}: {why}"
-        if why and section["unit"] == "deg" and "jumps" not in why and not set(_words(joint.position)) & _ANGLES:
+        if why and section["unit"] == "deg" and "jumps" not in why and not set(words_of(joint.position)) & ANGLES:
             how += f"; {_ASSUMED_ANGLE}"
         turn = self._turn(joint.position)
         if turn:
@@ -582,7 +467,7 @@ class _Guesser:
                 how += f"; not taken: {others}" * bool(others)
                 self._drive(joint, role, rest[0], how)
 
-    def _drive(self, joint: _Found, role: str, one: _Candidate, how: str) -> None:
+    def _drive(self, joint: _Found, role: str, one: Candidate, how: str) -> None:
         unit, assumed = one.unit, False
         position = str(joint.sections["position"]["unit"])
         if role == "reference":
@@ -597,7 +482,7 @@ class _Guesser:
         section: dict[str, Any] = {"column": one.name, "unit": unit}
         if role == "input":
             known = one.rank == 0 and "applied" not in one.name.casefold()
-            measured = unit in {"N m", "N"} and (known or (one.rank == 1 and not _is_command(one.name)))
+            measured = unit in {"N m", "N"} and (known or (one.rank == 1 and not is_command(one.name)))
             section["hold"] = "linear" if measured and not self._is_apart(one.name, joint.position) else "zero"
             how += f"; taken as {'a measurement' if section['hold'] == 'linear' else 'a command'}"
         if assumed and "taken for" not in how:
@@ -605,7 +490,7 @@ class _Guesser:
         joint.sections[role] = section
         joint.rows.append(Guess(role, one.name, unit, how, assumed))
 
-    def _steps_in(self, one: _Candidate, joints: Sequence[_Found]) -> bool:
+    def _steps_in(self, one: Candidate, joints: Sequence[_Found]) -> bool:
         """Return whether a column of one value begins after the motion, so that it is a step from 0."""
         stamps, motion = self._stamps(one.name), self._stamps(joints[0].position)
         values = self.columns.values(one.name)
@@ -694,59 +579,6 @@ class _Guesser:
 
     def _listed(self) -> str:
         return ", ".join(self.columns.columns)
-
-
-_STATES = ("position", "velocity")
-_WORD_OF = {"position": "angle"}
-
-
-def _tokens(name: str) -> list[str]:
-    """Return the words of a name: parts of paths, of camel case, and numbers."""
-    found: list[str] = []
-    for word in _TOKENS.findall(re.sub(r"[\[(][^\[\]()]*[A-Za-z°][^\[\]()]*[\])]", " ", name)):
-        low = word.casefold()
-        for ending in ("dot", "velocity", "vel"):
-            if low.endswith(ending) and low != ending and not low.startswith("d"):
-                found += [word[: -len(ending)], ending]
-                break
-        else:
-            if low[:1] == "d" and low[1:] in {"theta", "alpha", "phi", "th", "q", "x", "angle", "beta"}:
-                found += [word[1:], "dot"]
-            else:
-                found.append(word)
-    return found
-
-
-def _words(name: str) -> set[str]:
-    return {word.casefold() for word in _tokens(name)}
-
-
-def _is_derivative(words: Sequence[str]) -> bool:
-    """Return whether a capital or a separate d marks the derivative of an angle: ``angleD``, ``d_theta``."""
-    angles = _WORDS["angle"] | _WORDS["place"]
-    folded = [word.casefold() for word in words]
-    beside = [
-        (folded[index - 1 : index], folded[index + 1 : index + 2]) for index, one in enumerate(folded) if one == "d"
-    ]
-    return any(angles & {*before, *behind} for before, behind in beside)
-
-
-def _slides(name: str, *, alone: bool) -> bool:
-    """Return whether a name is that of a place; an x alone may be an angle."""
-    words = _words(name)
-    return bool(words & (_WORDS["place"] - ({"x"} if alone else set()))) and not words & _ANGLES
-
-
-def _is_command(name: str) -> bool:
-    return bool(_words(name) & {"con", "cmd", "command", "u", "control", "action"})
-
-
-def _label(name: str, stem: str) -> str:
-    """Return a name of a joint that a reader recognises."""
-    parts = [part for part in re.split(r"[/.]", name) if part]
-    if len(parts) > 1 and parts[-1].casefold() in {"position", "pos", "angle", "q"}:
-        return parts[-2]
-    return f"joint{stem}" if stem.isdecimal() else stem or name
 
 
 def _increases(values: Array) -> bool:

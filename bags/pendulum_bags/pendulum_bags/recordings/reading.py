@@ -18,10 +18,11 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.recordings.array_files import read_matlab, read_numpy
 from pendulum_bags.recordings.bag_columns import read_bag_columns
 from pendulum_bags.recordings.bridge_programs import last_words, run_bridge_program
+from pendulum_bags.recordings.column_names import is_of
 from pendulum_bags.recordings.columns import Column, Columns, part_of
 from pendulum_bags.recordings.contract_bags import read_contract_bag
 from pendulum_bags.recordings.delimited import read_delimited
-from pendulum_bags.recordings.guess import Guess, guess_rules, is_of
+from pendulum_bags.recordings.guess import Guess, guess_rules
 from pendulum_bags.recordings.mapping import MAPPINGS, Motion, Rules, apply_rules, load_rules
 from pendulum_bags.recordings.tables import is_lerobot, read_lerobot, read_parquet
 from pendulum_msgs_py.contract.names import JOINT_STATES
