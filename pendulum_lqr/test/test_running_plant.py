@@ -39,11 +39,14 @@ def watcher(domain_id: int) -> Iterator[Watcher]:
 def test_another_plant_is_reported_once_on_the_log_and_as_long_as_it_runs_in_diagnostics(
     watcher: Watcher, processes: Any
 ) -> None:
-    here = ("--ros-args", "-r", "__ns:=/sim", "-p")
+    slow = ("--ros-args", "-p", "rate_hz:=100.0")
+    here = ("-r", "__ns:=/sim", "-p")
     # Of two plants on the graph, only that of the controller's own states counts.
-    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/hw", "-p", "plant:=x5_9")
-    first = processes.start("pendulum_sim", "simulator", *here, "plant:=dfki")
-    controller = processes.start("pendulum_lqr", "controller", *here, "state_timeout:=2.0", "-p", "period:=0.002")
+    processes.start("pendulum_sim", "simulator", *slow, "-r", "__ns:=/hw", "-p", "plant:=x5_9")
+    first = processes.start("pendulum_sim", "simulator", *slow, *here, "plant:=dfki")
+    controller = processes.start(
+        "pendulum_lqr", "controller", "--ros-args", *here, "state_timeout:=2.0", "-p", "period:=0.01"
+    )
     told = controller.wait_for_output(r"designed for plant 'thesis', but 'dfki' runs: .*", 60).group()
     assert "damping 11.77, runs " in told
     assert " N m s/rad" in told
@@ -56,6 +59,6 @@ def test_another_plant_is_reported_once_on_the_log_and_as_long_as_it_runs_in_dia
     # The right plant comes instead: the warning goes.
     first.interrupt()
     first.wait(20)
-    processes.start("pendulum_sim", "simulator", *here, "plant:=thesis")
+    processes.start("pendulum_sim", "simulator", *slow, *here, "plant:=thesis")
     watcher.until(lambda: watcher.answering() and not watcher.answering("runs"), "answers without a warning", 60)
     assert watcher.told[_NAME].level == DiagnosticStatus.OK

@@ -13,14 +13,12 @@ PATIENCE = 60.0
 
 
 def test_move_holds_an_angle_and_its_stop_latches_until_its_reset(processes: ProcessGroup, domain_id: int) -> None:
-    environment = {"ROS_DOMAIN_ID": str(domain_id)}
-
     def move(goal: str) -> RunningProgram:
-        program = processes.start("pendulum_bags", "move", goal, "--namespace", "/sim", env=environment)
+        program = processes.start("pendulum_bags", "move", goal, "--namespace", "/sim")
         program.wait(PATIENCE)
         return program
 
-    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", env=environment)
+    processes.start("pendulum_sim", "simulator", "--ros-args", "-r", "__ns:=/sim", "-p", "rate_hz:=100.0")
     # A negative angle is no option.
     held = move("-0.15")
     assert held.returncode == 0, held.output

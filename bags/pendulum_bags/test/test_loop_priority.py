@@ -84,7 +84,8 @@ def test_a_bridge_and_an_emulated_module_that_somebody_starts_go_before_all_else
             wait_for(lambda one=child: "listens" in one.log.read_text(), 60.0, child.name)  # type: ignore[misc]
             assert _policies(child) == (ordinary if forbidden else {(os.SCHED_FIFO, PLANT_PRIORITY)})
             processes.finish(child)
-            for clock, parameters in (("realtime", {}), ("lockstep", lockstep)):
+            # Forbidden is forbidden, in whatever time.
+            for clock, parameters in (("realtime", {}), ("lockstep", lockstep))[: 1 if forbidden else 2]:
                 command = graph.bridge(f"/{name}_{clock}", backend="emulator", **parameters).command()  # type: ignore[arg-type]
                 child = processes.start(f"bridge_{name}_{clock}", command, environment=forbidden)
                 wait_for(lambda one=child: "ready" in one.log.read_text(), 60.0, child.name)  # type: ignore[misc]
