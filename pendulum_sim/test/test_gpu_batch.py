@@ -21,24 +21,24 @@ from pendulum_msgs_py.plants.plant_parameters import load_mechanism, load_plant
 from pendulum_sim.batches import cuda_kernels
 from pendulum_sim.batches.batch import simulate_batch
 
-cuda_kernels._PART = 2  # three parts, the last one not full
+cuda_kernels._PART = 3  # three parts, the last one not full; one plant alone would be other code
 steps = int(sys.argv[1])
 full = load_plant("dfki").with_values(
     static_friction=0.12, load_friction=0.02, actuator_time_constant=0.003, transport_delay=0.0033, effort_limit=20.0
 )
 acrobot = load_mechanism("acrobot").with_values({"elbow.transport_delay": 0.003, "elbow.time_constant": 0.004})
-common = {"seeds": np.arange(5), "hold": 3, "record": True}
+common = {"seeds": np.arange(8), "hold": 3, "record": True}
 batches = {
     "link": lambda device: simulate_batch(
-        load_plant("thesis"), variations={"inertia": np.linspace(0.05, 0.06, 5)}, steps=steps, method="etd2",
+        load_plant("thesis"), variations={"inertia": np.linspace(0.05, 0.06, 8)}, steps=steps, method="etd2",
         gain=(33.3, 0.16), amplitude=2.5, device=device, **common,
     ),
     "dry link": lambda device: simulate_batch(
-        [full, *(full.with_values(transport_delay=0.002 * k) for k in range(4))], steps=steps, method="etd2",
+        [full, *(full.with_values(transport_delay=0.002 * k) for k in range(7))], steps=steps, method="etd2",
         position=3.4, gain=(6.0, 0.6), amplitude=2.5, substeps=2, device=device, **common,
     ),
     "joints": lambda device: simulate_batch(
-        load_mechanism("double_pendulum_frictionless"), variations={"mass_2": np.linspace(0.6, 0.65, 5)}, steps=steps,
+        load_mechanism("double_pendulum_frictionless"), variations={"mass_2": np.linspace(0.6, 0.65, 8)}, steps=steps,
         gain=[[30.0, 5.0, 5.0, 1.0], [4.0, 20.0, 1.0, 3.0]], amplitude=(0.5, 0.25), device=device, **common,
     ),
     "dry joints": lambda device: simulate_batch(

@@ -143,7 +143,7 @@ def test_a_step_in_which_joints_rest_and_break_away_ends_where_fifty_short_ones_
 
 @pytest.mark.parametrize(
     ("preset", "seconds", "window", "late"),
-    [("furuta", 5.0, (0.1, 0.3), 45), ("cart_pole", 8.0, (0.2, 0.8), 0)],
+    [("furuta", 5.0, (0.1, 0.3), 45), ("cart_pole", 5.0, (0.2, 0.8), 0)],
 )
 def test_intervals_from_a_run_held_upright_hold_the_values_of_a_machine_that_is_off(preset, seconds, window, late):
     plant, run = load_mechanism(preset), run_balanced(preset, 3, seconds)
@@ -170,7 +170,7 @@ def test_intervals_from_a_run_held_upright_hold_the_values_of_a_machine_that_is_
 
 
 def test_a_tare_that_no_common_offset_explains_is_found_as_one_of_a_recording():
-    plant, run = load_mechanism("cart_pole"), run_balanced("cart_pole", 760, 8.0)
+    plant, run = load_mechanism("cart_pole"), run_balanced("cart_pole", 760, 5.0)
     half = len(run.position) // 2
     time = 0.002 * np.arange(half)
     halves = [
@@ -601,7 +601,7 @@ def test_a_csv_of_several_joints_is_replayed_and_the_plant_of_another_machine_is
 def test_chaotic_motion_is_fitted_in_windows_over_which_neighbours_stay_together():
     free = {f"{joint}.{key}": 0.0 for joint in ("shoulder", "elbow") for key in ("coulomb_friction", "damping")}
     plant = truth("double_pendulum").with_values(free)
-    chaotic = motion(plant, 5, seconds=30.0, swing=2.5)
+    chaotic = motion(plant, 5, seconds=20.0, swing=2.5)
     length = window_length(JointModel.of(plant), [chaotic], 5.0)
     assert length < 3.0
     result = identify_joints(plant.with_values(OFF["double_pendulum"]), [chaotic], extras="friction")
