@@ -189,7 +189,7 @@ def test_a_wrong_sign_of_an_effort_that_comes_late_is_named():
     plant, run = load_mechanism("furuta"), run_balanced("furuta", 3, 5.0)
     time = 0.002 * np.arange(len(run.position))
     recording = JointRecording("hw", time, run.position, -run.effort, ("zero", "zero"), velocity=run.velocity)
-    said = better_reading(plant, [prepare_windows(recording, 0.144)])
+    said = better_reading(JointModel.of(plant), [prepare_windows(recording, 0.144)])
     assert said is not None
     assert said.startswith("with the effort of arm negated")
 

@@ -2,28 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import xacro_hint
+from pendulum_msgs_py.programs.extras import how_to_install
 
-__all__ = ["read_model"]
+__all__ = ["import_mujoco", "read_model"]
 
 _PACKAGE = "package://"
 
 
-def read_model(mujoco: Any, path: Path) -> tuple[Any, list[str]]:
-    """Return the compiled model and remarks on omitted meshes; a ParameterError if MuJoCo refuses it."""
-    text = path.read_text(encoding="utf-8", errors="replace")
+def import_mujoco() -> Any:
+    """Return the module; a ParameterError says how to install it."""
+    # Imported late: it takes 60 MB.
+    try:
+        import mujoco
+    except ImportError as error:
+        raise ParameterError(how_to_install(error) or f"MuJoCo cannot be imported: {error}") from error
+    # It would write warnings to a file in the working folder; they are raised here as errors.
+    mujoco.set_mju_user_warning(lambda _text: None)
+    return mujoco
+
+
+def read_model(
+    mujoco: Any, path: Path, text: str | None = None, included: Mapping[str, bytes] | None = None
+) -> tuple[Any, list[str]]:
+    """Return the compiled model and remarks on omitted meshes; a ParameterError if there is none or MuJoCo refuses it.
+
+    ``text`` takes the place of the file's, and ``included``, by name, that of the files that it includes.
+    """
+    if text is None and not path.is_file():
+        raise ParameterError(f"model {path} does not exist; expected an MJCF or URDF file")
+    text = path.read_text(encoding="utf-8", errors="replace") if text is None else text
     if hint := xacro_hint(path, text):
         raise ParameterError(f"model {path} is no model yet: {hint}")
     remarks: list[str] = []
     try:
-        if "<robot" not in text or "<mesh" not in text:
-            return mujoco.MjModel.from_xml_path(str(path)), remarks
-        spec = mujoco.MjSpec.from_file(str(path))
-        for mesh in list(spec.meshes):
+        if included is None:
+            spec = mujoco.MjSpec.from_file(str(path))
+        else:
+            spec = mujoco.MjSpec.from_string(text, include=dict(included))
+            spec.modelfiledir = str(path.resolve().parent)
+        for mesh in list(spec.meshes) if "<robot" in text else ():
             found = _find(str(mesh.file), path)
             if found is not None and (problem := _problem(mujoco, found)) == "":
                 mesh.file = str(found)

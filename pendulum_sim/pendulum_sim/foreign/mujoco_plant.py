@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,10 +19,9 @@ from pendulum_msgs_py.contract.angles import wrap
 from pendulum_msgs_py.contract.joints import ONE_JOINT, Vector
 from pendulum_msgs_py.errors import FaultError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant
-from pendulum_msgs_py.programs.extras import how_to_install
-from pendulum_sim.foreign.mujoco_joint import ROUNDING, MujocoJoint
-from pendulum_sim.foreign.mujoco_mapping import JointMapping, MujocoMapping
-from pendulum_sim.foreign.mujoco_model import read_model
+from pendulum_sim.foreign.mujoco_joints import Hang, find_joints, place
+from pendulum_sim.foreign.mujoco_mapping import MujocoMapping
+from pendulum_sim.foreign.mujoco_model import import_mujoco, read_model
 from pendulum_sim.foreign.mujoco_switches import CAUSES, switch_off
 from pendulum_sim.stepping.mechanism_plant import MechanismState
 from pendulum_sim.stepping.plant import check_start, command_within
@@ -33,9 +30,6 @@ __all__ = ["MujocoPlant", "load_mujoco_plant"]
 
 PERIOD = 0.002
 """Default time between two states, unless the timestep is longer [s]."""
-_UNITS = {"HINGE": "rad", "SLIDE": "m"}
-_SWEEPS = 100
-"""Largest number of times that each joint is brought to where it hangs beneath the others."""
 
 
 def load_mujoco_plant(
@@ -55,25 +49,12 @@ def load_mujoco_plant(
     Raises:
         ParameterError: MuJoCo is missing or refuses the file, or the file has no such joints that can be driven.
     """
-    mujoco = _import_mujoco()
+    mujoco = import_mujoco()
     path = Path(path).expanduser()
-    if not path.is_file():
-        raise ParameterError(f"model {path} does not exist; expected an MJCF or URDF file")
     model, remarks = read_model(mujoco, path)
     plant = MujocoPlant(mujoco, model, mapping or MujocoMapping(), str(path), rate_hz, effort_limit, equation)
     plant.remarks += remarks
     return plant
-
-
-def _import_mujoco() -> Any:
-    # Imported late: it takes 60 MB.
-    try:
-        import mujoco
-    except ImportError as error:
-        raise ParameterError(how_to_install(error) or f"MuJoCo cannot be imported: {error}") from error
-    # It would write warnings to a file in the working folder; they are raised here as errors.
-    mujoco.set_mju_user_warning(lambda _text: None)
-    return mujoco
 
 
 class MujocoPlant:
@@ -101,22 +82,9 @@ class MujocoPlant:
             model.opt.timestep = mapping.timestep
         self.dt, self._substeps = self._choose_period(float(model.opt.timestep), rate_hz)
         coordinates = ONE_JOINT if equation is None else equation.coordinates
-        limits = (effort_limit,) if equation is None else equation.effort_limits
-        of_driven = dict(zip(coordinates.driven, limits, strict=True))
-        chosen = self._chosen(mapping) if equation is None else self._matched(mapping, equation)
-        self._joints = tuple(
-            MujocoJoint(
-                mujoco, model, self._data, path, joint, chosen[joint.name], driven=i in of_driven,
-                effort_limit=of_driven.get(i, 0.0),
-            )
-            for i, joint in enumerate(coordinates.joints)
-        )  # fmt: skip
+        limits, name = ((effort_limit,), "") if equation is None else (equation.effort_limits, equation.name)
+        self._joints, hangs = find_joints(mujoco, model, self._data, path, mapping, coordinates, limits, name)
         self._driven = tuple(self._joints[i] for i in coordinates.driven)
-        hangs = self._hang()
-        for joint, (_, hanging) in zip(self._joints, hangs, strict=True):
-            zero = chosen[joint.joint.name].zero
-            rests = 0.0 if joint.is_own else joint.rest(partial(self._place, hangs, joint), hanging)
-            joint.zero = rests if zero is None else zero
         if equation is None:
             self.parameters = self._describe(hangs)
         else:
@@ -127,7 +95,7 @@ class MujocoPlant:
             unit = joint.joint.unit
             through = f" through {joint.motor}, at most {joint.limit:g} {joint.unit}" if joint in self._driven else ""
             turned = ", turned round" if joint.sign < 0 else ""
-            rest = joint.rest(partial(self._place, hangs, joint), hanging)
+            rest = joint.rest(partial(place, mujoco, model, self._data, self._joints, hangs, joint), hanging)
             self.remarks.append(
                 f"joint {joint.name!r}{through}; its {joint.zero:.6g} {unit} are our 0{turned}; "
                 f"it hangs at {rest:.6g} {unit}"
@@ -212,58 +180,6 @@ class MujocoPlant:
 
     # --- contents of the file -------------------------------------------------------------------------------
 
-    def _chosen(self, mapping: MujocoMapping) -> Mapping[str, JointMapping]:
-        """Return the entries for the one joint of a pendulum."""
-        if mapping.joints:
-            listed = ", ".join(mapping.joints)
-            raise ParameterError(
-                f"the mapping of {self._path} has joints ({listed}); expected a plant file of several joints with them"
-            )
-        return {ONE_JOINT.joints[0].name: mapping.one}
-
-    def _matched(self, mapping: MujocoMapping, equation: PlantParameters) -> Mapping[str, JointMapping]:
-        """Return the entries of each joint; without any, joints of the file count by name, or else in order."""
-        joints = equation.mechanism.joints
-        found = {joint.name: mapping.joints.get(joint.name, JointMapping()) for joint in joints}
-        kinds = {int(getattr(self._mujoco.mjtJoint, f"mjJNT_{kind}")): unit for kind, unit in _UNITS.items()}
-        there = [
-            (str(self._model.joint(i).name), kinds[int(self._model.jnt_type[i])])
-            for i in range(self._model.njnt)
-            if int(self._model.jnt_type[i]) in kinds
-        ]
-        if all(each.joint or name in dict(there) for name, each in found.items()):
-            return found
-        if [unit for _, unit in there] == [joint.unit for joint in joints] and all(name for name, _ in there):
-            for joint, (name, _) in zip(joints, there, strict=True):
-                found[joint.name] = replace(found[joint.name], joint=found[joint.name].joint or name)
-            return found
-        has = ", ".join(f"{name or 'one without a name'} [{unit}]" for name, unit in there) or "none"
-        raise ParameterError(
-            f"{self._path} has the joints {has}; expected those of {equation.name}, {equation.coordinates.with_units}, "
-            "by these names or in this order, or joints in a mapping file"
-        )
-
-    def _hang(self) -> list[tuple[float, float]]:
-        """Return weight and hanging position of each joint, in the file's terms, with all of them hanging."""
-        found = [(0.0, float(self._model.qpos0[joint.qpos])) for joint in self._joints]
-        for _ in range(_SWEEPS):
-            before = list(found)
-            for i, joint in enumerate(self._joints):
-                weight, hanging = joint.weight(partial(self._place, found, joint))
-                # Removes the fit's rounding, and -pi.
-                hanging = 0.0 if abs(hanging) < ROUNDING else hanging
-                found[i] = weight, math.pi if abs(abs(hanging) - math.pi) < ROUNDING else hanging
-            if len(found) == 1 or max(abs(a[1] - b[1]) for a, b in zip(found, before, strict=True)) < ROUNDING:
-                break
-        return found
-
-    def _place(self, hangs: list[tuple[float, float]], moved: MujocoJoint, position: float) -> None:
-        """Put one joint at rest at a position of the file's, and the others where they hang."""
-        self._mujoco.mj_resetData(self._model, self._data)
-        for joint, (_, hanging) in zip(self._joints, hangs, strict=True):
-            joint.put(position if joint is moved else hanging)
-        self._mujoco.mj_forward(self._model, self._data)
-
     def _choose_period(self, timestep: float, rate_hz: float) -> tuple[float, int]:
         if not rate_hz:
             substeps = max(1, math.floor(PERIOD / timestep + 1e-9))
@@ -277,11 +193,11 @@ class MujocoPlant:
             )
         return 1.0 / rate_hz, round(steps)
 
-    def _describe(self, hangs: list[tuple[float, float]]) -> PlantParameters:
+    def _describe(self, hangs: list[Hang]) -> PlantParameters:
         """Return the closest equation of a pendulum."""
         model, data, mujoco = self._model, self._data, self._mujoco
         ((weight, hanging),), (joint,) = hangs, self._joints
-        self._place(hangs, joint, hanging)
+        place(mujoco, model, data, self._joints, hangs, joint, hanging)
         # In slow motion a motor behind a spring moves with the link.
         dofs = sorted({joint.dof, joint.driven_dof})
         inertia = 0.0

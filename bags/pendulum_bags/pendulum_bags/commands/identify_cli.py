@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Collection, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +16,7 @@ from rich.markup import escape
 
 from pendulum_bags.commands.recording_options import Dt, Mappings, Topics, WriteMapping, readings_of, show_guesses
 from pendulum_bags.runs.run_folder import write_json
+from pendulum_msgs_py.contract.joints import ONE_JOINT
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.friction_terms import FRICTION_TERMS
@@ -25,7 +27,9 @@ from pendulum_msgs_py.programs.typed_commands import as_typed
 
 if TYPE_CHECKING:
     from pendulum_bags.identification.result import IdentificationResult
+    from pendulum_bags.identification.simulation_result import SimulationResult
     from pendulum_bags.identification.thesis import ThesisResult
+    from pendulum_bags.recordings.reading import Reading
     from pendulum_bags.runs.datasets import Recording
 
 __all__ = ["app", "main"]
@@ -36,6 +40,7 @@ Hold = Annotated[
 ]
 _OF_READING = frozenset({"mapping", "write_mapping", "topic", "dt"})
 _FOR_SEVERAL_JOINTS = frozenset({"plant", *_OF_READING, "window", "held_out", "out", "name", "page", "as_json"})
+_FOR_SIMULATION = _FOR_SEVERAL_JOINTS - {"name", "page"} | {"model", "parameter", "model_mapping"}
 _FOR_REGRESSION = frozenset({"method", *_OF_READING, "hold", "experiment", "skew", "out", "page", "as_json", "verbose"})
 _FOR_REGRESSION_ALONE = frozenset({"experiment", "skew", "verbose"})
 
@@ -79,7 +84,8 @@ def identify(
         list[Path] | None, typer.Option(help="Recordings to score only; may be given more than once.")
     ] = None,
     out: Annotated[
-        Path | None, out_option("Plant file to write (*.yaml), with a .json and figures next to it.")
+        Path | None,
+        out_option("Plant file to write (*.yaml), with a .json and figures next to it; of --model, the same file."),
     ] = None,
     name: Annotated[str, typer.Option(help="Name of the plant in that file.")] = "identified",
     effort_limit: Annotated[float, typer.Option(help="Largest torque of the actuator [N m].")] = 13.0,
@@ -89,6 +95,20 @@ def identify(
             help="For several joints: mechanism to start from, such as double_pendulum, or a plant file; data are "
             "bags, or CSV files with all joints."
         ),
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(help="MJCF or URDF file in which numbers are identified; --out writes the same file with them."),
+    ] = None,
+    parameter: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="With --model: number to fit, such as joint/arm/damping, body/link/mass or actuator/motor/gear, with "
+            "=LOW:HIGH to bound it; may be given more than once. By default those that the recordings show."
+        ),
+    ] = None,
+    model_mapping: Annotated[
+        Path | None, typer.Option(help="With --model: its mapping file, as of --simulation.")
     ] = None,
     page: Annotated[bool, typer.Option(help="With --out: write figures and a page too.")] = True,
     as_json: Json = False,
@@ -102,6 +122,8 @@ def identify(
 
     Several joints: python -m pendulum_bags identify run1.csv run2.csv --plant double_pendulum --mapping columns.yaml
     --held-out run3.csv --out plant.yaml
+
+    Numbers of a MuJoCo model: python -m pendulum_bags identify run1.csv --model robot.xml --out new.xml
     """
     from pendulum_bags.runs.read_recording import read_recording
 
@@ -109,6 +131,14 @@ def identify(
     readings = readings_of(paths, _mappings(mapping, len(data), len(paths)), topic, dt)
     # Guesses are shown even if an error follows.
     context.call_on_close(partial(show_guesses, make_console(stderr=True), readings, write_mapping))
+    if model is not None:
+        _refuse_unheeded(context, "--model", _FOR_SIMULATION)
+        found_in_file = _of_model(model, model_mapping, plant, parameter, readings, len(data), window)
+        written = found_in_file.write(out) if out and not found_in_file.refused else None
+        _finish(found_in_file, written, False, as_json)
+        return
+    if parameter or model_mapping:
+        raise DataError("--parameter and --model-mapping have no effect without --model; expected it with them")
     if plant is not None:
         _refuse_unheeded(context, "--plant", _FOR_SEVERAL_JOINTS)
         from pendulum_bags.identification.identify import identify_joints
@@ -147,6 +177,50 @@ def identify(
     found = run(everything[: len(data)], options, held_out=everything[len(data) :])
     written = found.write(out, name=name, effort_limit=effort_limit) if out and not found.refused else None
     _finish(found, written, page, as_json, contradicts=found.geometry is not None and found.geometry.contradicts)
+
+
+def _of_model(
+    path: Path,
+    mapping: Path | None,
+    plant: str | None,
+    parameters: Sequence[str] | None,
+    readings: Sequence[Reading],
+    count: int,
+    window: float | None,
+) -> SimulationResult:
+    """Return the numbers of a model file, fitted to the first ``count`` readings and scored on the others."""
+    from pendulum_bags.identification.joint_recordings import read_joints
+    from pendulum_bags.identification.simulation_model import MujocoMotion
+    from pendulum_bags.identification.simulation_result import identify_simulation
+    from pendulum_msgs_py.plants.plant_parameters import load_mechanism
+    from pendulum_sim.foreign.model_source import ModelSource
+    from pendulum_sim.foreign.mujoco_mapping import load_mujoco_mapping
+
+    coordinates = None if plant is None else load_mechanism(plant).coordinates
+    entries = load_mujoco_mapping(mapping, () if coordinates is None else coordinates.joints) if mapping else None
+    if all(one.motion.joints[0].drive is None for one in readings) and coordinates is None:
+        coordinates = replace(ONE_JOINT, driven=())
+    motion = MujocoMotion(ModelSource(path), entries, coordinates)
+    logs = [read_joints(reading, motion.coordinates) for reading in readings]
+    wanted = dict(map(_wanted, parameters or ()))
+    options = {"mapping": str(mapping)} if mapping else {}
+    if plant is not None:
+        options["plant"] = plant
+    return identify_simulation(motion, logs[:count], wanted, held_out=logs[count:], window=window, simulation=options)
+
+
+def _wanted(text: str) -> tuple[str, tuple[float, float] | None]:
+    """Return path and domain of a ``--parameter``."""
+    name, equals, ends = text.partition("=")
+    if not equals:
+        return name, None
+    try:
+        low, high = (float(end) for end in ends.split(":"))
+    except ValueError:
+        low, high = 1.0, 0.0
+    if not low < high:
+        raise DataError(f"--parameter is {text!r}; expected PATH, or PATH=LOW:HIGH with two numbers, LOW the smaller")
+    return name, (low, high)
 
 
 def _finish(

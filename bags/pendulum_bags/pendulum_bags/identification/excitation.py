@@ -17,7 +17,7 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.covariance import information
-from pendulum_bags.identification.joint_fit import WeightedErrors, motions, prepare_windows
+from pendulum_bags.identification.joint_fit import WeightedErrors, prepare_windows
 from pendulum_bags.identification.joint_model import DELAY, LAG, JointModel
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.model import BOUNDS, from_plant
@@ -266,7 +266,7 @@ def _motion(problem: _Problem, effort: Array) -> tuple[Array, Array]:
     whole = replace(problem, time=np.concatenate([lead, time]) - lead[0])
     padded = _joint_recording(whole, np.concatenate([np.zeros(_LEAD), effort]), np.zeros((time.size + _LEAD, count)))
     data, model = prepare_windows(padded, float(whole.time[-1]) + 1.0), _joint_model(problem.plant)
-    path = motions(model, model.vector[None], data, np.zeros((1, 1, 2 * count)))[0, 0][data.inside[0]]
+    path = model.motions(model.vector[None], data, np.zeros((1, 1, 2 * count)))[0, 0][data.inside[0]]
     return path[-time.size :, :count], path[-time.size :, count:]
 
 

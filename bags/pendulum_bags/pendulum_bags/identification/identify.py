@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -14,13 +14,14 @@ from pendulum_bags.identification.between_recordings import Alone, excluding
 from pendulum_bags.identification.covariance import FREQUENCY, candidate_errors
 from pendulum_bags.identification.explained import REFUSED, Explained, explained, undetermined_fit
 from pendulum_bags.identification.geometry import check_geometry
-from pendulum_bags.identification.joint_fit import prepare_windows
+from pendulum_bags.identification.joint_fit import JointFit, prepare_windows
 from pendulum_bags.identification.joint_fit import scores as joint_scores
-from pendulum_bags.identification.joint_model import tellable
+from pendulum_bags.identification.joint_model import JointModel
 from pendulum_bags.identification.joint_readings import explained_joints, refusal, undetermined_joints
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.joint_search import search
 from pendulum_bags.identification.joint_uncertainty import assess_joints, each_alone, hold_undetermined
+from pendulum_bags.identification.motion_model import MotionModel
 from pendulum_bags.identification.options import DEFAULTS, Options
 from pendulum_bags.identification.output_error import OutputErrorFit, fit_output_error
 from pendulum_bags.identification.own_offsets import OwnOffsets
@@ -35,13 +36,15 @@ from pendulum_bags.identification.result import (
     fingerprint,
 )
 from pendulum_bags.identification.solver import solve
-from pendulum_bags.identification.uncertainty import assess
+from pendulum_bags.identification.uncertainty import Uncertainty, assess
 from pendulum_bags.identification.window_score import free_run, window_score
 from pendulum_bags.runs.datasets import Recording, distinct_names
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["identify", "identify_joints"]
+__all__ = ["identify", "identify_joints", "identify_motions"]
+
+R = TypeVar("R", bound=IdentificationResult)
 
 _ONE_MACHINE = {FREQUENCY: 1.1, "inertia": 1.35, "gravity": 1.35}
 """Ratios up to which what differs from recording to recording may be one machine's: what the model lacks moves them."""
@@ -201,10 +204,32 @@ def identify_joints(
         fitted, kept = ([each.at_standstill(plant) for each in some] for some in (recordings, held_out))
         options: Any = {"held_out": kept, "window": window, "extras": extras, "stride": stride}
         return _behind_motors(plant, identify_joints(plant.torque_plant, fitted, **options))
+    return identify_motions(
+        JointModel.of(plant), recordings, IdentificationResult, undetermined_joints,
+        held_out=held_out, window=window, extras=extras, stride=stride,
+    )  # fmt: skip
+
+
+@threadpool_limits.wrap(limits=1, user_api="blas")
+def identify_motions(
+    start: MotionModel,
+    recordings: Sequence[JointRecording],
+    make: Callable[..., R],
+    lost: Callable[[JointFit, Uncertainty], str | None],
+    *,
+    held_out: Sequence[JointRecording] = (),
+    window: float | None = None,
+    extras: str | None = None,
+    stride: int = 1,
+) -> R:
+    """Identify any simulation of joints as :func:`identify_joints` does.
+
+    ``make`` makes the result of its fields; ``lost`` says, in a sentence, what the recordings do not determine.
+    """
     for recording in (*recordings, *held_out):
-        recording.check(plant.coordinates)
+        recording.check(start.coordinates)
     check_distinct(recordings, held_out)
-    best = search(plant, recordings, window, extras, stride)
+    best = search(start, recordings, window, extras, stride)
     found, held = hold_undetermined(best.fit)
     names = distinct_names([*recordings, *held_out])
     training = dict(zip(names, found.scores, strict=False))
@@ -214,8 +239,8 @@ def identify_joints(
     )
     alone = each_alone(found)
     uncertainty = assess_joints(found, held, alone)
-    account = explained_joints(found, refusal(found, training, outside) or undetermined_joints(found, uncertainty))
-    sizes = dict.fromkeys((name for name in tellable(plant) if name in found.free), _ONE_SIZE)
+    account = explained_joints(found, refusal(found, training, outside) or lost(found, uncertainty))
+    sizes = dict.fromkeys((name for name in start.sizes if name in found.free), _ONE_SIZE)
     account, two = _one_machine(account, excluding(alone, sizes, found.model.unit))
     notes = _notes(recordings, best.pushed)
     if found.own:
@@ -225,7 +250,7 @@ def identify_joints(
         notes.append(
             f"Windows of {best.length:.2g} s: over longer ones neighbouring motions part (chaos, or no balance)."
         )
-    return IdentificationResult(
+    return make(
         found,
         best.extras,
         {name: (error, None) for name, error in best.candidates.items()},

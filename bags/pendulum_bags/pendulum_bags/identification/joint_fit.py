@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.arrowhead import Solution, minimise
 from pendulum_bags.identification.covariance import Information, information
-from pendulum_bags.identification.joint_kernel import lagged, motion_kernel
-from pendulum_bags.identification.joint_model import DELAY, LAG, JointModel
+from pendulum_bags.identification.joint_kernel import lagged
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.kernel import cumulative_input
+from pendulum_bags.identification.motion_model import MotionModel
 from pendulum_bags.identification.problem import cut_windows, first_state, off_line, sensor_noise
 from pendulum_bags.recordings.clock import longest_step
 from pendulum_msgs_py.errors import DataError
@@ -37,7 +37,6 @@ __all__ = [
     "first_weights",
     "fit",
     "line_errors",
-    "motions",
     "noise_of",
     "prepare_windows",
     "rms_by_joint",
@@ -221,7 +220,7 @@ def noise_of(position: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class JointFit(Solution[JointModel]):
+class JointFit(Solution[MotionModel]):
     """A fit of several joints.
 
     Attributes:
@@ -242,7 +241,7 @@ class JointFit(Solution[JointModel]):
         return fit(weights=weights, **{**start, "own": self.own, "offsets": self.offsets, **changes})
 
     @property
-    def models(self) -> list[JointModel]:
+    def models(self) -> list[MotionModel]:
         """The model of each recording, with its own offsets."""
         return [self.model.with_changes(dict(zip(self.own, row, strict=True))) for row in self.offsets]
 
@@ -253,7 +252,7 @@ class JointFit(Solution[JointModel]):
         0 in the padding and where no velocity was measured.
         """
         rows = zip(self.models, self.data, self.states, strict=True)
-        return [_errors(part, motions(one, one.vector[None], part, x[None])[0]) for one, part, x in rows]
+        return [_errors(part, one.motions(one.vector[None], part, x[None])[0]) for one, part, x in rows]
 
     @cached_property
     def information(self) -> Information:
@@ -278,18 +277,7 @@ class JointFit(Solution[JointModel]):
         return max(score.share for score in self.scores)
 
 
-def motions(model: JointModel, values: Array, data: Windows, states: Array) -> Array:
-    """Return motions, shape (c, w, l, 2 n), of values (c, parameters) and start states (c, w, 2 n)."""
-    pairs, which = np.unique(values[:, model.index((DELAY, LAG))], axis=0, return_inverse=True)
-    drive = np.array([data.input(*pair) for pair in pairs])
-    path = np.empty((len(values), *data.time.shape, states.shape[-1]))
-    steps, starts = np.diff(data.time, axis=1), np.ascontiguousarray(states)
-    run = motion_kernel(model.plant.mechanism.name)
-    run(*model.tables(values), drive, which.reshape(-1), steps, starts, path)
-    return path
-
-
-def sensitivity(model: JointModel, names: Sequence[str], data: Windows, states: Array, path: Array) -> Array:
+def sensitivity(model: MotionModel, names: Sequence[str], data: Windows, states: Array, path: Array) -> Array:
     """Return those of a motion to parameters and start states, shape (w, l, 2 n, k + 2 n)."""
     index, width = model.index(names), states.shape[1]
     steps = np.array([*(_DIFFERENCE * model.size(name) for name in names), *[_DIFFERENCE] * width])
@@ -300,7 +288,7 @@ def sensitivity(model: JointModel, names: Sequence[str], data: Windows, states: 
             values[c, index[c]] += step
         else:
             starts[c, :, c - len(index)] += step
-    found = (motions(model, values, data, starts) - path) / steps[:, None, None, None]
+    found = (model.motions(values, data, starts) - path) / steps[:, None, None, None]
     return np.moveaxis(found, 0, -1)
 
 
@@ -320,18 +308,18 @@ class WeightedErrors:
     last: tuple[Array, Array, Array] | None = None
     scale: float = math.inf
 
-    def _path(self, model: JointModel, states: Array) -> Array:
+    def _path(self, model: MotionModel, states: Array) -> Array:
         last = self.last
         if last is None or not (np.array_equal(last[0], model.vector) and np.array_equal(last[1], states)):
-            path = motions(model, model.vector[None], self.part, states[None])[0]
+            path = model.motions(model.vector[None], self.part, states[None])[0]
             self.last = last = (model.vector, states, path)
         return last[2]
 
-    def errors(self, model: JointModel, states: Array) -> Array:
+    def errors(self, model: MotionModel, states: Array) -> Array:
         """Return all errors, of positions before velocities at each sample."""
         return np.ravel(_errors(self.part, self._path(model, states)) * self.weights)
 
-    def sensitivities(self, model: JointModel, states: Array, names: Sequence[str]) -> tuple[Array, Array, list[int]]:
+    def sensitivities(self, model: MotionModel, states: Array, names: Sequence[str]) -> tuple[Array, Array, list[int]]:
         """Return sensitivities, errors and ends of windows; see :class:`~arrowhead.Motion`."""
         path, part = self._path(model, states), self.part
         own = self.weights * np.repeat([1.0, float(part.velocity is not None)], part.position.shape[-1])
@@ -343,7 +331,7 @@ class WeightedErrors:
 # Far along an unstable motion sensitivities overflow; what is not finite is refused.
 @np.errstate(over="ignore", invalid="ignore")
 def fit(
-    model: JointModel,
+    model: MotionModel,
     data: Sequence[Windows],
     free: Sequence[str],
     weights: Array,
@@ -364,7 +352,7 @@ def fit(
     Raises:
         DataError: The start's motion leaves all bounds.
     """
-    count = len(model.plant.joints)
+    count = len(model.coordinates.joints)
     weights = np.concatenate((weights, np.zeros(count))) if weights.size == count else weights
     found = minimise(
         model,
@@ -384,7 +372,7 @@ def fit(
 
 
 def scores(
-    model: JointModel, data: Sequence[Windows], weights: Array | None = None, *, own: Sequence[str] = ()
+    model: MotionModel, data: Sequence[Windows], weights: Array | None = None, *, own: Sequence[str] = ()
 ) -> list[Score]:
     """Return how well a model explains each recording, with the start of each window and its ``own`` offsets fitted.
 
@@ -397,15 +385,14 @@ def scores(
     return found
 
 
-def window_length(model: JointModel, recordings: Sequence[JointRecording], longest: float) -> float:
+def window_length(model: MotionModel, recordings: Sequence[JointRecording], longest: float) -> float:
     """Return the longest window over which motions that begin close to each other stay near, up to ``longest`` [s].
 
     Along the measured motion the equation, linearised and without dry friction (which hides an unstable equilibrium as
     long as a joint rests), carries a small difference on. Where it grows by more than a factor of 30 (3 where
     velocities were measured) a fit has many minima: chaotic motion, and motion about an unstable equilibrium.
     """
-    n, lengths = len(model.plant.joints), []
-    smooth = model.with_changes({f"{joint}.coulomb_friction": 0.0 for joint in model.plant.coordinates.names}).vector
+    n, lengths, smooth = len(model.coordinates.joints), [], model.smooth
     for recording in recordings:
         stride = max(1, round(_LONGEST / recording.period))
         time, q = recording.time[::stride], recording.position[::stride]
@@ -419,7 +406,7 @@ def window_length(model: JointModel, recordings: Sequence[JointRecording], longe
         data = Windows(recording, steps, steps > 0.0, np.stack((q[:-1], q[1:]), axis=1), None, states, _area(recording))
         starts = np.tile(states, (2 * n + 1, 1, 1))
         starts[np.arange(1, 2 * n + 1), :, np.arange(2 * n)] += _DIFFERENCE
-        path = motions(model, np.tile(smooth, (2 * n + 1, 1)), data, starts)[:, :, 1]
+        path = smooth.motions(np.tile(smooth.vector, (2 * n + 1, 1)), data, starts)[:, :, 1]
         gain = np.moveaxis((path[1:] - path[0]) / _DIFFERENCE, 0, -1)
         most = _APART if recording.velocity is None else _APART_BY_VELOCITY
         for first in range(0, len(gain), max(1, len(gain) // 12)):

@@ -10,24 +10,21 @@ with u after a first-order lag, delay d and lag common to all motors, and F_i th
 from __future__ import annotations
 
 import cmath
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from pendulum_bags.arrays import Array
-from pendulum_bags.identification.arrowhead import Model, Prior
+from pendulum_bags.identification.arrowhead import Prior
+from pendulum_bags.identification.joint_kernel import motion_kernel
+from pendulum_bags.identification.motion_model import DELAY, LAG, MotionModel, Timeline
+from pendulum_msgs_py.contract.joints import Coordinates
 from pendulum_msgs_py.dynamics.arithmetic import complex_step, in_arithmetic
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pack_joints
 
 __all__ = ["DELAY", "LAG", "JointModel", "tellable"]
-
-DELAY = "delay"
-"""Time from the recorded effort to its effect, negative where the effort is recorded late [s]."""
-
-LAG = "time_constant"
-"""First-order lag of the actuators [s]."""
 
 _SPREADS = {"length": 0.03, "rotor": 0.05}
 """Standard deviations of lengths and rotor inertias in the plant file, as shares of them: a ruler's, and that of a
@@ -42,7 +39,7 @@ _WEAK = 1e-3
 
 
 @dataclass(frozen=True)
-class JointModel(Model):
+class JointModel(MotionModel):
     """A mechanism with the numbers of a fit.
 
     Attributes:
@@ -67,24 +64,34 @@ class JointModel(Model):
         zeros = [0.0] * (2 * len(joints) + 2)
         return cls(plant, np.array([*plant.packed, *(joint.coulomb_friction for joint in joints), *zeros]))
 
-    def index(self, names: Sequence[str]) -> list[int]:
-        """Return where some parameters are."""
-        own = self.names
-        return [own.index(name) for name in names]
+    @property
+    def coordinates(self) -> Coordinates:
+        """Joints of the plant."""
+        return self.plant.coordinates
 
-    def __getitem__(self, name: str) -> float:
-        """Return a value by name."""
-        return float(self.vector[self.names.index(name)])
+    @property
+    def label(self) -> str:
+        """Name of the plant."""
+        return self.plant.name
+
+    @property
+    def start(self) -> JointModel:
+        """The model that the plant file makes."""
+        return JointModel.of(self.plant)
+
+    @property
+    def smooth(self) -> JointModel:
+        """The model without dry friction."""
+        return self.with_changes({f"{joint}.coulomb_friction": 0.0 for joint in self.coordinates.names})
+
+    @property
+    def sizes(self) -> tuple[str, ...]:
+        """Names of the mechanism's own parameters that motion tells apart."""
+        return tellable(self.plant)
 
     def with_vector(self, vector: Array) -> JointModel:
         """Return the model with other values."""
         return JointModel(self.plant, np.array(vector, dtype=float))
-
-    def with_changes(self, changes: Mapping[str, float]) -> JointModel:
-        """Return the model with some values changed."""
-        vector = self.vector.copy()
-        vector[self.index(list(changes))] = list(changes.values())
-        return self.with_vector(vector)
 
     def unit(self, name: str) -> str:
         """Return the unit of a parameter."""
@@ -106,7 +113,7 @@ class JointModel(Model):
 
     def prior(self, names: Sequence[str]) -> Prior:
         """Return what the plant file knows of some parameters."""
-        start = JointModel.of(self.plant)
+        start = self.start
         known = np.array([start[name] for name in names])
         return Prior(known, np.array([self.spread(name) for name in names]) ** -2.0)
 
@@ -116,7 +123,7 @@ class JointModel(Model):
 
     def size(self, name: str) -> float:
         """Return a scale of a parameter, in its unit, so that steps and ranks do not depend on units."""
-        value = abs(float(JointModel.of(self.plant)[name]))
+        value = abs(self.start[name])
         if value > 0.0:
             return value
         return {DELAY: 0.01, LAG: 1e-3}.get(name, 0.01 if name.endswith("offset") else 1e-3)
@@ -131,6 +138,14 @@ class JointModel(Model):
         if joints.driven:
             names += [name for name, wanted in ((DELAY, delay), (LAG, lag)) if wanted]
         return tuple(names)
+
+    def held(self, free: Sequence[str]) -> str:
+        """Return in a sentence which of the mechanism's own parameters are not free."""
+        held = [spec.name for spec in self.plant.mechanism.parameters if spec.name not in free]
+        return (
+            "Held at the values of the plant file, as known or since no motion tells them from the others: "
+            f"{', '.join(held)}. Where one of them is wrong, the fitted ones carry its error."
+        )
 
     @property
     def own_offsets(self) -> tuple[tuple[str, ...], ...]:
@@ -163,6 +178,16 @@ class JointModel(Model):
             if LAG in free:
                 changes[f"{joint}.{LAG}"] = self[LAG]
         return plant.with_values(changes)
+
+    def motions(self, values: Array, data: Timeline, states: Array) -> Array:
+        """Return motions, shape (c, w, l, 2 n), of values (c, parameters) and start states (c, w, 2 n)."""
+        pairs, which = np.unique(values[:, self.index((DELAY, LAG))], axis=0, return_inverse=True)
+        drive = np.array([data.input(*pair) for pair in pairs])
+        path = np.empty((len(values), *data.time.shape, states.shape[-1]))
+        steps, starts = np.diff(data.time, axis=1), np.ascontiguousarray(states)
+        run = motion_kernel(self.plant.mechanism.name)
+        run(*self.tables(values), drive, which.reshape(-1), steps, starts, path)
+        return path
 
     def tables(self, values: Array) -> tuple[Array, Array, Array, Array]:
         """Return the arguments of :func:`motion_kernel` for c sets of values, shape (c, parameters)."""

@@ -12,13 +12,14 @@ import numpy as np
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.explained import LARGEST_SHARE, REFUSED, Explained
 from pendulum_bags.identification.joint_fit import MOST, JointFit, Score, Windows, first_weights, fit, noise_of
-from pendulum_bags.identification.joint_model import DELAY, JointModel, tellable
+from pendulum_bags.identification.joint_model import JointModel
+from pendulum_bags.identification.motion_model import DELAY, MotionModel
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_bags.identification.residual_tests import INCOMPLETE
 from pendulum_bags.identification.uncertainty import Uncertainty
+from pendulum_msgs_py.contract.joints import Coordinates
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.determined import undetermined
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
 __all__ = ["better_reading", "explained_joints", "far_off", "refusal", "undetermined_joints"]
 
@@ -65,10 +66,10 @@ class _Reading:
         )
 
 
-def _readings(plant: PlantParameters, data: Sequence[Windows]) -> Iterator[_Reading]:
+def _readings(coordinates: Coordinates, data: Sequence[Windows]) -> Iterator[_Reading]:
     """Yield what a mapping file gets wrong without a trace: order, signs, units, zeros, an angle against the world."""
-    names, driven, count = plant.coordinates.names, plant.coordinates.driven, len(plant.joints)
-    joints = plant.coordinates.joints
+    names, driven, joints = coordinates.names, coordinates.driven, coordinates.joints
+    count = len(joints)
     unit, zero = np.eye(count), np.zeros(count)
     if count > 1:
         swap = unit[[1, 0, *range(2, count)]]
@@ -79,8 +80,8 @@ def _readings(plant: PlantParameters, data: Sequence[Windows]) -> Iterator[_Read
     if driven:
         every = "every effort" if len(driven) > 1 else f"the effort of {names[driven[0]]}"
         yield _Reading(f"{every} negated", signs, unit, -unit, zero)
-        milli = f"expected {plant.coordinates.drive_unit}: correct its unit in the mapping file"
-        yield _Reading(f"{every} in m{plant.coordinates.drive_unit}", milli, unit, 1e-3 * unit, zero)
+        milli = f"expected {coordinates.drive_unit}: correct its unit in the mapping file"
+        yield _Reading(f"{every} in m{coordinates.drive_unit}", milli, unit, 1e-3 * unit, zero)
     for i in driven if len(driven) > 1 else ():
         yield _Reading(f"the effort of {names[i]} negated", signs, unit, unit - 2.0 * np.diag(unit[i]), zero)
     for i in range(1, count):
@@ -107,10 +108,10 @@ def _readings(plant: PlantParameters, data: Sequence[Windows]) -> Iterator[_Read
 
 def refusal(found: JointFit, training: Mapping[str, Score], held_out: Mapping[str, Score]) -> str | None:
     """Return why a fit is no model of the machine, by its scores, in a sentence; None where it may be one."""
-    plant, data = found.model.plant, found.data
+    data = found.data
     far = far_off(found)
     if far is not None or max(score.share for score in training.values()) > DOUBTFUL_SHARE:
-        better = better_reading(plant, data, found)
+        better = better_reading(found.model.start, data, found)
         if better is not None:
             return f"{REFUSED}: {better}"
     noise = 6.0 * np.max([noise_of(part.recording.position) for part in data], axis=0)
@@ -123,7 +124,7 @@ def refusal(found: JointFit, training: Mapping[str, Score], held_out: Mapping[st
         shares = score.shares(least)
         worst = int(np.argmax(shares))
         if shares[worst] > LARGEST_SHARE:
-            joint = plant.coordinates.joints[worst]
+            joint = found.model.coordinates.joints[worst]
             return (
                 f"{REFUSED}: {name}: the model misses {joint.name} by {score.rms[worst]:.3g} {joint.unit}, "
                 f"{100.0 * shares[worst]:.0f} % of what straight lines miss; expected less than "
@@ -147,28 +148,29 @@ def explained_joints(found: JointFit, refused: str | None) -> Explained:
         tuple(np.sqrt(np.mean(np.square(values), axis=0)).tolist())
         for values in zip(*((one.rms, one.lines) for one in found.scores), strict=True)
     )
-    return Explained(rms, lines, found.worst, refused, incomplete, found.model.plant.coordinates.joints)
+    return Explained(rms, lines, found.worst, refused, incomplete, found.model.coordinates.joints)
 
 
 def undetermined_joints(found: JointFit, uncertainty: Uncertainty) -> str | None:
     """Return the sentence that the recordings do not determine what a plant file needs; None where they do."""
-    intervals, unit = uncertainty.intervals, found.model.unit
+    intervals, model = uncertainty.intervals, found.model
+    assert isinstance(model, JointModel)
     try:
-        identified = found.model.identified(found.free, found.model.plant.name)
+        identified = model.identified(found.free, model.plant.name)
     except ParameterError as error:
         return f"{REFUSED}: {error}"
     ends = {name: (one.low, one.high) for name, one in intervals.items()}
-    lost = [f"{name} ({intervals[name].text} {unit(name)})" for name in undetermined(identified, ends)]
+    lost = [f"{name} ({intervals[name].text} {model.unit(name)})" for name in undetermined(identified, ends)]
     return f"{REFUSED}: the recordings do not determine {', '.join(lost)}" if lost else None
 
 
 def far_off(found: JointFit) -> str | None:
     """Return the first fitted size that is not that of a machine near the start, in a sentence; None without one."""
-    plant = found.model.plant
-    for name in tellable(plant):
-        start, value = plant.value(name), found.model[name]
+    model, begin = found.model, found.model.start
+    for name in model.near:
+        start, value = begin[name], model[name]
         if name in found.free and start > 0.0 and not start / _FAR < value < start * _FAR:
-            unit = found.model.unit(name)
+            unit = model.unit(name)
             times = f"{value / start:.0f}" if value > start else f"{value / start:.2g}"
             return (
                 f"{REFUSED}: {name} is {value:.4g} {unit}, {times} times the starting plant's {start:.4g} {unit}; "
@@ -177,7 +179,7 @@ def far_off(found: JointFit) -> str | None:
     return None
 
 
-def better_reading(plant: PlantParameters, data: Sequence[Windows], found: JointFit | None = None) -> str | None:
+def better_reading(start: MotionModel, data: Sequence[Windows], found: JointFit | None = None) -> str | None:
     """Return how the columns are to be read, with what mends it, where that alone explains the motion; else None.
 
     Each reading is fitted to a few short windows, and so is the given one: a fit that ended in a poor minimum is no
@@ -187,17 +189,17 @@ def better_reading(plant: PlantParameters, data: Sequence[Windows], found: Joint
     if found is not None:
         own = _share(found)
     few = [part.subset(range(0, len(part.time), max(1, len(part.time) // _QUICK))) for part in data]
-    unit = np.eye(len(plant.joints))
+    unit = np.eye(len(start.coordinates.joints))
     given = _Reading("", "", unit, unit, np.zeros(len(unit)))
     least, best = math.inf, None
-    for reading in (given, *_readings(plant, data)):
-        share = _fits(plant, reading, few)
+    for reading in (given, *_readings(start.coordinates, data)):
+        share = _fits(start, reading, few)
         # Another reading has to be far better than the given one.
         if share < (least if best is not None or reading is given else _BETTER * least):
             least, best = share, reading
     if best is None or best is given:
         return None
-    whole = _fits(plant, best, data)
+    whole = _fits(start, best, data)
     if whole > DOUBTFUL_SHARE or whole > _BETTER * own:
         return None
     instead = f" instead of {100.0 * own:.2g} %" if math.isfinite(own) else ""
@@ -207,13 +209,13 @@ def better_reading(plant: PlantParameters, data: Sequence[Windows], found: Joint
     )
 
 
-def _fits(plant: PlantParameters, reading: _Reading, data: Sequence[Windows]) -> float:
+def _fits(model: MotionModel, reading: _Reading, data: Sequence[Windows]) -> float:
     """Return the share that a quick fit under a reading misses, inf where it ends far from the start.
 
     The delay of a loop of 500 Hz, 5 ms, hides the sign of an effort that balances a machine: it is fitted, too.
     """
     others = [reading.of(part) for part in data]
-    model, weights = JointModel.of(plant), first_weights(others)
+    weights = first_weights(others)
     free, shares = model.fitted(), [math.inf]
     with suppress(DataError, np.linalg.LinAlgError):
         shares.append(_share(fit(model, others, free, weights, most=15, tolerance=1e-3)))

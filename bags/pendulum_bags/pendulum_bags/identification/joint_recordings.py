@@ -201,6 +201,8 @@ def _ordered(reading: Reading, coordinates: Coordinates) -> tuple[list[JointMoti
     names, is_bag = coordinates.names, reading.has_states
     if sorted(found) == sorted(names):
         return [found[name] for name in names], ""
+    if len(found) == len(names) == 1:
+        return list(found.values()), ""
     known, origin = ", ".join(name or "one without a name" for name in found), reading.motion.meta["mapping"]
     if len(found) != len(names) or not (is_bag or reading.rules.guessed):
         raise DataError(f"{origin} of {reading.name}: joints are {known}; expected {', '.join(names)}")

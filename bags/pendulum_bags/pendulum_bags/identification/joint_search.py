@@ -22,16 +22,15 @@ from pendulum_bags.identification.joint_fit import (
     prepare_windows,
     window_length,
 )
-from pendulum_bags.identification.joint_model import DELAY, JointModel
 from pendulum_bags.identification.joint_readings import better_reading, far_off
 from pendulum_bags.identification.joint_recordings import JointRecording
+from pendulum_bags.identification.motion_model import DELAY, MotionModel
 from pendulum_bags.identification.own_offsets import pay
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_bags.identification.selection import effective_samples
 from pendulum_msgs_py.errors import DataError
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["EXTRAS", "Found", "search"]
+__all__ = ["EXTRAS", "Found", "default_window", "search"]
 
 _WINDOW = (0.5, 5.0)
 """Shortest and longest window by default [s], where neighbouring motions stay together. Each window's start takes up
@@ -75,7 +74,7 @@ _WORTH = 0.98
 
 
 def _choose(
-    start: JointModel, data: Sequence[Windows], weights: Array, extras: str | None
+    start: MotionModel, data: Sequence[Windows], weights: Array, extras: str | None
 ) -> tuple[JointFit, str, dict[str, float]]:
     """Return the fit that predicts best what it has not seen, which candidate it is, and the held-out error of each.
 
@@ -104,7 +103,7 @@ def _choose(
     return _with_own_offsets(start, best[1], weights), best[2], errors
 
 
-def _with_own_offsets(start: JointModel, found: JointFit, weights: Array) -> JointFit:
+def _with_own_offsets(start: MotionModel, found: JointFit, weights: Array) -> JointFit:
     groups = found.model.own_offsets if len(found.data) > 1 else ()
     if not groups:
         return found
@@ -123,7 +122,7 @@ def _with_own_offsets(start: JointModel, found: JointFit, weights: Array) -> Joi
         for own in groups
     ]
     best = min(trials, key=lambda one: one.cost)
-    each = weights[: len(found.model.plant.joints)]
+    each = weights[: len(found.model.coordinates.joints)]
     left = [
         joint[inside]
         for errors, part in zip(found.residuals, found.data, strict=True)
@@ -184,24 +183,19 @@ class Found:
 
 
 def search(
-    plant: PlantParameters, recordings: Sequence[JointRecording], window: float | None, extras: str | None, stride: int
+    start: MotionModel, recordings: Sequence[JointRecording], window: float | None, extras: str | None, stride: int
 ) -> Found:
     """Return the best fit to recordings; arguments as of :func:`identify_joints`.
 
     Raises:
         DataError: The recordings are too short, or no fit explains them.
     """
-    sixth = sum(recording.duration for recording in recordings) / 6.0
-    longest = float(np.clip(sixth, *_WINDOW)) if window is None else window
     measured = all(recording.velocity is not None for recording in recordings)
-    shortest = _SHORTEST_BY_VELOCITY if measured else _SHORTEST
-    start, length = JointModel.of(plant), window
-    if length is None:
-        length = max(window_length(start, recordings, longest), shortest)
+    length, longest = default_window(start, recordings) if window is None else (window, window)
     if extras is None and measured and all(recording.period * stride <= _FAST for recording in recordings):
         # Measured to their velocity, the recordings show these: left out, they would bias what is left.
         extras = ALL_EXTRAS
-    best = _Search(plant, recordings, extras, stride).best(length, fixed=window is not None)
+    best = _Search(start, recordings, extras, stride).best(length, fixed=window is not None)
     found, pushed = _without_pushes(best.fit)
     # Now that the errors are known, each measurement counts by its own; of a fit to be refused none does.
     for _ in range(0 if found.worst > LARGEST_SHARE else 2 if measured else 1):
@@ -209,11 +203,19 @@ def search(
     return replace(best, fit=found, parted=window is None and best.length < longest, pushed=pushed)
 
 
+def default_window(start: MotionModel, recordings: Sequence[JointRecording]) -> tuple[float, float]:
+    """Return the length of windows by default, and what it would be if neighbouring motions stayed together [s]."""
+    longest = float(np.clip(sum(recording.duration for recording in recordings) / 6.0, *_WINDOW))
+    measured = all(recording.velocity is not None for recording in recordings)
+    shortest = _SHORTEST_BY_VELOCITY if measured else _SHORTEST
+    return max(window_length(start, recordings, longest), shortest), longest
+
+
 @dataclass(frozen=True)
 class _Search:
     """A fit from the start, or by way of shorter windows where that ends in a poor minimum."""
 
-    plant: PlantParameters
+    start: MotionModel
     recordings: Sequence[JointRecording]
     extras: str | None
     stride: int
@@ -224,7 +226,7 @@ class _Search:
         Raises:
             DataError: There are too few windows, or none is explained.
         """
-        start = JointModel.of(self.plant)
+        start = self.start
         data = self._windows(length)
         first = self._attempt(start, data, length)
         tried = [first] if isinstance(first, Found) else []
@@ -250,13 +252,13 @@ class _Search:
         if shortest is not None and (best is None or best.fit.worst > LARGEST_SHARE):
             best = shortest
         if best is None:
-            raise DataError(better_reading(self.plant, data) or str(first))
+            raise DataError(better_reading(self.start, data) or str(first))
         return best
 
-    def _late(self, start: JointModel, data: list[Windows]) -> JointModel | None:
+    def _late(self, start: MotionModel, data: list[Windows]) -> MotionModel | None:
         """Return the start with the delay that explains most; None where that is its own."""
         weights, costs = first_weights(data), dict[float, float]()
-        models = dict[float, JointModel]()
+        models = dict[float, MotionModel]()
         for delay in dict.fromkeys((start[DELAY], *_DELAYS)):
             models[delay] = start.with_changes({DELAY: delay})
             with suppress(DataError):
@@ -274,7 +276,7 @@ class _Search:
             )
         return data
 
-    def _attempt(self, start: JointModel, data: list[Windows], length: float) -> Found | DataError:
+    def _attempt(self, start: MotionModel, data: list[Windows], length: float) -> Found | DataError:
         try:
             return Found(*_choose(start, data, first_weights(data), self.extras), length)
         except DataError as error:

@@ -10,7 +10,7 @@ from pendulum_bags.distributions import student_quantile
 from pendulum_bags.identification.between_recordings import Alone, half_width
 from pendulum_bags.identification.covariance import Errors, standard_errors
 from pendulum_bags.identification.joint_fit import JointFit
-from pendulum_bags.identification.joint_model import DELAY, JointModel, tellable
+from pendulum_bags.identification.motion_model import DELAY
 from pendulum_bags.identification.notes import Interval, held_sentences, open_sentences
 from pendulum_bags.identification.readings import DOUBTFUL_SHARE
 from pendulum_bags.identification.uncertainty import Uncertainty
@@ -23,7 +23,7 @@ __all__ = ["assess_joints", "each_alone", "hold_undetermined"]
 
 def hold_undetermined(found: JointFit) -> tuple[JointFit, list[str]]:
     """Return the fit with sizes that the recordings do not determine held at the start's, and their names."""
-    start, own, held = JointModel.of(found.model.plant), set(tellable(found.model.plant)), list[str]()
+    start, own, held = found.model.start, set(found.model.sizes), list[str]()
     if found.worst > DOUBTFUL_SHARE:
         return found, held
     for _ in range(len(own) - 1):

@@ -43,7 +43,8 @@ class Interval:
         """Its ends in words."""
         if not np.isfinite(self.high):
             return f"{self.low:.4g} or more" if np.isfinite(self.low) else "anything"
-        return f"{self.low:.4g} to {self.high:.4g}"
+        digits = next((n for n in (4, 6, 8) if f"{self.low:.{n}g}" != f"{self.high:.{n}g}"), 10)
+        return f"{self.low:.{digits}g} to {self.high:.{digits}g}"
 
     def to_json(self) -> dict[str, float]:
         """Return value, ends and standard error as JSON values."""
@@ -136,21 +137,16 @@ def edge_sentences(intervals: Mapping[str, Interval], fit: OutputErrorFit, unres
 
 
 def held_sentences(found: JointFit, undetermined: Sequence[str]) -> list[str]:
-    """Return what was held in the fit of a mechanism, ``undetermined`` or known, and what its plant file leaves out."""
+    """Return what was held in the fit of several joints, ``undetermined`` or known, and what no file of it has."""
     said, model = [], found.model
     if undetermined:
         said.append(
-            f"The recordings do not determine {', '.join(undetermined)}: held at the starting plant's value, without "
-            "interval."
+            f"The recordings do not determine {', '.join(undetermined)}: held at the start's value, without interval."
         )
-    held = [spec.name for spec in model.plant.mechanism.parameters if spec.name not in found.free]
-    said.append(
-        "Held at the values of the plant file, as known or since no motion tells them from the others: "
-        f"{', '.join(held)}. Where one of them is wrong, the fitted ones carry its error."
-    )
+    said.append(model.held(found.free))
     offsets = [f"{n} {model[n]:+.3g} {model.unit(n)}" for n in (*found.free, *found.own) if n.endswith("effort_offset")]
     if offsets:
-        said.append(f"The recorded efforts have offsets, which the plant file leaves out: {', '.join(offsets)}.")
+        said.append(f"The recorded efforts have offsets, which the file leaves out: {', '.join(offsets)}.")
     return said
 
 

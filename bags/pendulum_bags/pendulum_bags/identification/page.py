@@ -85,7 +85,7 @@ class _Motion:
 def _motions(result: IdentificationResult) -> Iterator[_Motion]:
     fit = result.fit
     if isinstance(fit, JointFit):
-        unit = fit.model.plant.coordinates.drive_unit
+        unit = fit.model.coordinates.drive_unit
         for name, part, errors in zip(result.training, fit.data, fit.residuals, strict=True):
             simulated, log = part.position + errors, part.recording
             simulated[:, 0] = np.nan

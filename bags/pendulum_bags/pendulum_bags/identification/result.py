@@ -22,6 +22,7 @@ from pendulum_bags.identification.joint_fit import JointFit, Score
 from pendulum_bags.identification.joint_model import JointModel
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.model import FRICTION_MODELS, PLANT_FRICTION_MODELS, UNITS, FitModel, to_plant
+from pendulum_bags.identification.motion_model import MotionModel
 from pendulum_bags.identification.notes import Interval
 from pendulum_bags.identification.output_error import OutputErrorFit
 from pendulum_bags.identification.residual_tests import INCOMPLETE, ResidualTests
@@ -86,7 +87,7 @@ class IdentificationResult:
     motors: PlantParameters | None = field(default=None, kw_only=True)
 
     @property
-    def model(self) -> FitModel | JointModel:
+    def model(self) -> FitModel | MotionModel:
         """The fitted model."""
         return self.fit.model
 
@@ -138,7 +139,7 @@ class IdentificationResult:
         Raises:
             ParameterError: No body has the masses and inertias that were found.
         """
-        assert isinstance(self.fit, JointFit)
+        assert isinstance(self.fit.model, JointModel)
         found = self.fit.model.identified(self.fit.free, name)
         return found if self.motors is None else found.with_motors(self.motors)
 
@@ -172,8 +173,8 @@ class IdentificationResult:
             if predicted:
                 cells.append(f"+-{predicted[name]:.2g}" if name in predicted else "-")
             rows.append((*cells, self.model.unit(name)))
-        one = len(self.explained.joints) == 1
-        unit, scale = ("mrad", 1e3) if one else ("% of the motion", 100.0)
+        one, by_angle = len(self.explained.joints) == 1, isinstance(self.fit, OutputErrorFit)
+        unit, scale = ("mrad", 1e3) if by_angle else ("% of the motion", 100.0)
         errors = [
             (name, *("-" if each is None else f"{scale * each:.3f}" for each in pair), "chosen" * (name == self.choice))
             for name, pair in self.candidates.items()
@@ -185,7 +186,7 @@ class IdentificationResult:
             for name, score in found.items()
         ]
         window = "the whole recording" if self.window is None else f"windows of {self.window:.3g} s"
-        rule = CHOICE if one and len(errors) > 1 else ""
+        rule = CHOICE if by_angle and len(errors) > 1 else ""
         return [
             Table(f"Identified by output error: {self.choice}", "", head, rows),
             Table("Candidates", rule, ("model", f"held-out rms [{unit}]", f"training rms [{unit}]", ""), errors),
@@ -249,6 +250,7 @@ class IdentificationResult:
     def _own_values(self) -> dict[str, Any]:
         assert isinstance(self.fit, JointFit)
         own = dict(zip(self.fit.own, self.fit.offsets.T.tolist(), strict=True))
+        assert isinstance(self.fit.model, JointModel)
         return {"mechanism": self.fit.model.plant.mechanism.name, "own_offsets": own}
 
     def write(self, path: str | Path, *, name: str = "identified") -> Path:
