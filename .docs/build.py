@@ -35,6 +35,7 @@ PACKAGES = (
 NODES = (
     ("simulator", "pendulum_sim.simulator.simulator_node", ("SPECS",)),
     ("mujoco", "pendulum_sim.simulator.engines", ("MUJOCO",)),
+    ("fmu", "pendulum_sim.simulator.engines", ("FMU",)),
     ("gymnasium", "pendulum_sim.simulator.engines", ("GYMNASIUM",)),
     ("adopt", "pendulum_sim.simulator.adopt_node", ("SPECS",)),
     ("viewer", "pendulum_sim.pictures.viewer_node", ("SPECS",)),

@@ -5,6 +5,7 @@ __all__ = ["EXECUTABLES"]
 EXECUTABLES: dict[str, str] = {
     "simulator": "pendulum_sim.simulator.simulator_node:main",
     "mujoco": "pendulum_sim.simulator.mujoco_node:main",
+    "fmu": "pendulum_sim.simulator.fmu_node:main",
     "gymnasium": "pendulum_sim.simulator.gymnasium_node:main",
     "adopt": "pendulum_sim.simulator.adopt_node:main",
     "viewer": "pendulum_sim.pictures.viewer_node:main",

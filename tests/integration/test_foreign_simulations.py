@@ -13,6 +13,7 @@ from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_msgs_py.ros import qos
 from pendulum_msgs_py.ros.convert import stamp_from_message
 from pendulum_sim.exports.model_files import mjcf
+from pendulum_testing.fmu import build_fmu
 from pendulum_testing.plant_peer import PlantPeer
 from pendulum_testing.processes import ProcessGroup, RunningProgram
 
@@ -42,19 +43,26 @@ def start(processes: ProcessGroup, program: str, *parameters: str) -> RunningPro
     return processes.start("pendulum_sim", program, "--ros-args", *arguments)
 
 
+@pytest.mark.parametrize("kind", ["mujoco", "fmu"])
 def test_two_lockstep_runs_of_a_model_file_give_the_same_messages(
-    peer: Peer, processes: ProcessGroup, tmp_path: Path
+    peer: Peer, processes: ProcessGroup, tmp_path: Path, kind: str
 ) -> None:
-    model = tmp_path / "thesis.xml"
+    model, mapping = tmp_path / "thesis.xml", tmp_path / "mapping.yaml"
     model.write_text(mjcf(load_plant("thesis")), encoding="utf-8")
+    if kind == "fmu":
+        pytest.importorskip("fmpy")
+        pytest.importorskip("pythonfmu")
+        model = build_fmu(tmp_path, 2)
+    mapping.write_text("format: pendulum_simulation/1\neffort_limit: {value: 3.0, unit: N m}\n", encoding="utf-8")
     peer.torque = 1.0
     runs = []
     for _ in range(2):
         peer.states.clear()
         program = start(
             processes,
-            "mujoco",
+            kind,
             f"model:={model}",
+            f"mapping:={mapping}",
             "clock:=lockstep",
             "lockstep_duration:=0.3",
             "start:=random",

@@ -124,6 +124,12 @@ class ModelSource:
         """Whether it is a description of ROS."""
         return self._root.tag == "robot"
 
+    def rollout(self, threads: int) -> Any:
+        """Return MuJoCo's runner of many motions at a time, on some threads."""
+        from mujoco import rollout
+
+        return rollout.Rollout(nthread=threads if threads > 1 else 0)
+
     # --- parameters ---------------------------------------------------------------------------------------------
 
     def parameter(self, name: str) -> ModelParameter:

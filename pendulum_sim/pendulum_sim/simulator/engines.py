@@ -21,6 +21,7 @@ from pendulum_msgs_py.plants.plant_parameters import (
 )
 from pendulum_msgs_py.plants.sealed_plant import load_plant_to_run
 from pendulum_sim.foreign.equation_check import EquationCheck, Switches, check_equation
+from pendulum_sim.foreign.fmu_environment import load_fmu_mapping, load_fmu_plant
 from pendulum_sim.foreign.guarded_plant import GuardedPlant, in_one_sentence
 from pendulum_sim.foreign.gymnasium_plant import load_adapter, load_gymnasium_plant
 from pendulum_sim.foreign.mujoco_mapping import MujocoMapping, load_mujoco_mapping
@@ -28,7 +29,17 @@ from pendulum_sim.foreign.mujoco_plant import load_mujoco_plant
 from pendulum_sim.stepping.integrators import METHODS
 from pendulum_sim.stepping.plants import JointPlant, OneJoint, make_plant
 
-__all__ = ["GYMNASIUM", "GYMNASIUM_PREFIX", "MUJOCO", "OWN", "Engine", "Simulation", "find_engine", "open_simulation"]
+__all__ = [
+    "FMU",
+    "GYMNASIUM",
+    "GYMNASIUM_PREFIX",
+    "MUJOCO",
+    "OWN",
+    "Engine",
+    "Simulation",
+    "find_engine",
+    "open_simulation",
+]
 
 
 class Simulation(NamedTuple):
@@ -151,6 +162,18 @@ def _make_gymnasium(values: Mapping[str, Any]) -> Simulation:
     return _foreign(OneJoint(plant), env, env, plant.description, plant.remarks, reseeded=again)
 
 
+def _make_fmu(values: Mapping[str, Any]) -> Simulation:
+    model, mapping = values["model"], values["mapping"]
+    if not model:
+        raise ParameterError("model is missing; expected -p model:=FILE, an FMU")
+    if values.get("plant"):
+        raise ParameterError(f"an FMU has one joint, and {values['plant']} several; expected a plant of one joint")
+    entries = load_fmu_mapping(mapping) if mapping else None
+    with in_one_sentence(f"model {model}", "loading", ParameterError):
+        plant = load_fmu_plant(model, entries, effort_limit=values["effort_limit"])
+    return _foreign(OneJoint(plant), model, Path(model).name, plant.description, plant.remarks)
+
+
 def _foreign(
     plant: JointPlant, name: str, label: str, description: str, remarks: Sequence[str],
     *, switches: Switches | None = None, reseeded: JointPlant | None = None,
@@ -239,6 +262,23 @@ GYMNASIUM = Engine(
     foreign=True,
     example="python -m pendulum_sim gymnasium --ros-args -r __ns:=/sim -p env:=Pendulum-v1",
 )  # fmt: skip
+
+FMU = Engine(
+    program="fmu",
+    description="An FMU (FMI 2 or 3, co-simulation) behind the interface that simulator and hardware share.",
+    specs=(
+        ParameterSpec("model", "", "", "FMU.", read_only=True),
+        ParameterSpec(
+            "mapping", "", "", "Mapping file: angle, velocity, torque, start, start values; empty for none.",
+            read_only=True,
+        ),
+        *_FOREIGN_SPECS,
+    ),
+    make=_make_fmu,
+    foreign=True,
+    example="python -m pendulum_sim fmu --ros-args -r __ns:=/sim -p model:=pendulum.fmu",
+)  # fmt: skip
+FMU_SUFFIX = ".fmu"
 GYMNASIUM_PREFIX = "gymnasium:"
 
 
@@ -246,7 +286,8 @@ def find_engine(simulation: str) -> tuple[Engine, dict[str, str]]:
     """Return the engine of a model file or ``gymnasium:ID``, and the parameters that name it."""
     if simulation.startswith(GYMNASIUM_PREFIX):
         return GYMNASIUM, {"env": simulation.removeprefix(GYMNASIUM_PREFIX)}
-    return MUJOCO, {"model": str(Path(simulation).expanduser().resolve())}
+    path = Path(simulation).expanduser().resolve()
+    return FMU if path.suffix.lower() == FMU_SUFFIX else MUJOCO, {"model": str(path)}
 
 
 def open_simulation(simulation: str, mapping: str = "", plant: str = "") -> Simulation:

@@ -43,7 +43,7 @@ __all__ = [
 ]
 
 HARDWARE = ("emulator", "hebi")
-MODEL_FILES = (".xml", ".mjcf", ".urdf")
+MODEL_FILES = (".xml", ".mjcf", ".urdf", ".fmu")
 DEFAULT_STRATEGY = "direct_pwm"
 SETTLE_TIME = 1.0
 """Time under control before the noise starts [s]."""

@@ -81,8 +81,8 @@ class ForeignSimulation:
         """Raise a ParameterError if it is too weak or slow to be held upright; noise is held ``hold_time`` [s]."""
         found = self.parameters
         if found.is_pendulum and found.gravity >= found.effort_limit:
-            environment = find_engine(self.name)[0].program == "gymnasium"
-            way = "set, on the attribute that limits it," if environment else "effort_limit with actuator: none"
+            ways = {"gymnasium": "set, on the attribute that limits it,", "fmu": "effort_limit"}
+            way = ways.get(find_engine(self.name)[0].program, "effort_limit with actuator: none")
             raise ParameterError(
                 f"simulation {self.name} gives at most {found.effort_limit:g} N m, its weight takes up to "
                 f"{found.gravity:.4g} N m: no ramp brings it upright; expected more torque, as {way} in a mapping file"

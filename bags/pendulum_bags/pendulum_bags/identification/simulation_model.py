@@ -53,8 +53,6 @@ class MujocoMotion:
     def __init__(
         self, source: ModelSource, mapping: MujocoMapping | None = None, coordinates: Coordinates | None = None
     ) -> None:
-        from mujoco import rollout
-
         self.source, self.mapping = source, mapping or MujocoMapping()
         self._mujoco = source.mujoco
         self.model = self._prepared(source.model)
@@ -74,7 +72,7 @@ class MujocoMotion:
             )
         threads = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
         self._threads = [self._mujoco.MjData(self.model) for _ in range(threads)]
-        self._rollout = rollout.Rollout(nthread=threads if threads > 1 else 0)
+        self._rollout = source.rollout(threads)
         self._cache: OrderedDict[tuple[Any, ...], Any] = OrderedDict()
         self._columns()
 
