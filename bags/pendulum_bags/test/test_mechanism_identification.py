@@ -237,7 +237,7 @@ def test_swapped_columns_are_refused_by_name(both_driven):
 def test_a_wrong_sign_and_an_angle_against_the_world_are_named(name, position, effort, words):
     plant, one = truth(name), motion(truth(name), 3, 3.0)
     wrong = replace(one, position=one.position @ np.array(position, dtype=float).T, effort=one.effort * effort)
-    said = better_reading(plant, [prepare_windows(wrong, 0.5)])
+    said = better_reading(JointModel.of(plant), [prepare_windows(wrong, 0.5)])
     assert said is not None
     assert said.startswith(words)
 
