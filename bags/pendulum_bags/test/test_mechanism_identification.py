@@ -520,9 +520,8 @@ def test_sizes_that_the_motion_does_not_determine_are_held_and_said_so():
 
 def test_recordings_of_a_mechanism_have_offsets_of_their_own_and_those_of_two_machines_exclude_each_other():
     plant, tare = truth("double_pendulum"), np.array((0.15, -0.06))
-    one, other = motion(plant, 1), motion(plant, 2)
-    tared = replace(other, effort=other.effort + tare)
-    third = replace(motion(plant, 3), effort=motion(plant, 3).effort - tare)
+    one, other, third = (motion(plant, seed, 4.0) for seed in (1, 2, 3))
+    tared, third = replace(other, effort=other.effort + tare), replace(third, effort=third.effort - tare)
     result = identify_joints(plant, [one, tared], held_out=[third], extras="friction")
     assert result.fit.own == ("shoulder.effort_offset", "elbow.effort_offset")
     assert result.fit.offsets[1] - result.fit.offsets[0] == pytest.approx(-tare, abs=0.01)
@@ -533,7 +532,7 @@ def test_recordings_of_a_mechanism_have_offsets_of_their_own_and_those_of_two_ma
     (score,) = result.held_out.values()
     assert score.rms.max() < 10.0 * NOISE
     assert not identify_joints(plant, [one, other], extras="friction").fit.own
-    heavier = motion(plant.with_values({"inertia_2": 1.4 * plant.value("inertia_2")}), 2)
+    heavier = motion(plant.with_values({"inertia_2": 1.4 * plant.value("inertia_2")}), 2, 4.0)
     two = identify_joints(plant, [one, heavier], extras="friction")
     assert any("exclude each other: fitted alone, inertia_2 is" in said for said in two.sentences())
 
