@@ -28,7 +28,7 @@ pytestmark = pytest.mark.timeout(600)
 NOISE = 5.0
 SPEED = 0.2
 """Mean speed of the ramps [rad/s], the default: faster ones look like a stuck duty to a busy bridge."""
-SHORT = f"--ramp-speed {SPEED} --contenders 3 --seeds 1 --periods 3"
+SHORT = f"--ramp-speed {SPEED} --contenders 3 --seeds 1 --periods 3 --signal-period 2"
 """Each step of the default run, with less of it."""
 
 
