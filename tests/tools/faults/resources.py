@@ -204,7 +204,7 @@ def recorder_runs_out_of_memory(folder: Path, headroom: int = 48 << 20) -> Outco
         limit = pages * os.sysconf("SC_PAGE_SIZE") + headroom
         resource.prlimit(child.process.pid, resource.RLIMIT_AS, (limit, limit))
         publisher = orchestrator.node.create_publisher(String, _NOISE_TOPIC, qos.DIAGNOSTICS)
-        message = String(data="x" * (2 << 20))
+        message = String(data="x" * (8 << 20))
         deadline = time.monotonic() + _TIMEOUT
         while child.process.poll() is None and time.monotonic() < deadline:
             publisher.publish(message)
