@@ -164,7 +164,7 @@ def test_every_node_has_permissions_but_the_player() -> None:
     named_otherwise = {
         "effort_adapter": "effort_controller",
         "trajectory_action": "joint_trajectory_controller",
-    } | dict.fromkeys(("mujoco", "gymnasium", "adopt"), "simulator")
+    } | dict.fromkeys(("mujoco", "gymnasium", "fmu", "adopt"), "simulator")
     assert {named_otherwise.get(program, program) for program in programs} <= NODES.keys()
     assert "player" not in NODES
 
