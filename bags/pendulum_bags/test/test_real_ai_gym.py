@@ -13,7 +13,7 @@ import pytest
 
 from pendulum_bags.commands.public_study_cli import main
 from pendulum_bags.studies.real_ai_gym import CONTESTS, SIMULATED, TOLERANCE, comparisons, read_trials, score_of
-from pendulum_bags.studies.real_ai_gym_page import study_text
+from pendulum_bags.studies.real_ai_gym_page import Study, study_text
 from pendulum_msgs_py.errors import DataError
 
 FIRST, BY_V2, PERTURBED, IROS, ICRA = CONTESTS
@@ -90,7 +90,7 @@ def test_a_clone_is_ranked_and_its_scores_are_checked(clone):
     assert one.ranking is not None
     assert (one.ranking.pick, one.ranking.best) == ("a", "b")
     assert [(pair.picked, pair.better, pair.sure) for pair in one.ranking.wrong] == [("a", "b", True), ("a", "c", True)]
-    text = "\n".join(study_text(trials, [one]))
+    text = "\n".join(study_text(Study(trials, [one])))
     assert "7 of 9 scores computed from trajectories equal the published ones" in text
     assert "IROS 2024, b, trial 1: computed 0.8" in text
     assert "published 0.100, for a cause that is not known" in text

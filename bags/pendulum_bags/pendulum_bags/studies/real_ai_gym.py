@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pendulum_bags.arrays import Array
 from pendulum_bags.ranking.contender import Contender
 from pendulum_bags.ranking.ranking import Ranking, rank
 from pendulum_bags.recordings.delimited import read_delimited
@@ -23,6 +24,7 @@ from pendulum_bags.studies.mechanism_benchmark import (
     BENCHMARK_PLANTS,
     CRITERIA,
     CRITERIA_HARDWARE,
+    Criterion,
     benchmark_plant,
     criteria_of,
     score_v1,
@@ -40,8 +42,11 @@ __all__ = [
     "Contest",
     "Trial",
     "comparisons",
+    "published_score",
     "read_trials",
     "score_of",
+    "score_of_rows",
+    "trajectory_rows",
 ]
 
 TOLERANCE = 0.005
@@ -65,7 +70,7 @@ class Contest(NamedTuple):
     """A contest: folder of its trials below ``data/ROBOT``, version of its score, folder of its simulation or empty.
 
     ``duration`` is the planned length of a trial [s]; ``paired`` says that trial i of each controller had the same
-    perturbations.
+    perturbations; ``norms`` are a robot's own, where its board was made with others.
     """
 
     name: str
@@ -74,17 +79,17 @@ class Contest(NamedTuple):
     simulation: str = ""
     duration: float = 10.0
     paired: bool = False
+    norms: tuple[tuple[str, tuple[Criterion, ...]], ...] = ()
 
 
+_PERTURBED = tuple(one._replace(norm=1.0) if one.name == "torque_smoothness" else one for one in CRITERIA)
 CONTESTS = (
     Contest("first board", "real_system", "v1", "simulation"),
     Contest("first board by v2", "real_system", "v2", "simulation_v2"),
-    Contest("first board, perturbed", "real_system_perturbed", "v2"),
+    Contest("first board, perturbed", "real_system_perturbed", "v2", norms=(("acrobot", _PERTURBED),)),
     Contest("IROS 2024", "real_system_iros2024", "v2", "simulation_v2", paired=True),
     Contest("ICRA 2025", "real_system_icra2025", "v3", "simulation_icra2025", 60.0),
 )
-_PERTURBED = [one._replace(norm=1.0) if one.name == "torque_smoothness" else one for one in CRITERIA]
-"""The perturbed acrobot's board was made with norms of its own."""
 
 
 class Trial(NamedTuple):
@@ -117,23 +122,32 @@ class Comparison(NamedTuple):
     trials: dict[str, int]
 
 
-def score_of(contest: Contest, robot: str, trajectory: Path) -> tuple[float, float]:
-    """Return a trajectory's score by the contest's rules on the machine, and the same of a run of any length.
+def trajectory_rows(trajectory: Path) -> Array:
+    """Return a trajectory's rows of time, measured state and commanded torques, shape (N, 7).
 
     Raises:
-        DataError: The file lacks one of the columns of time, measured states and commanded torques.
+        DataError: The file lacks one of these columns.
     """
     table = read_delimited(trajectory)
     if missing := [name for name in _COLUMNS if name not in table.columns]:
         raise DataError(
             f"{trajectory} lacks the columns {', '.join(missing)}; expected a trajectory of the leaderboard"
         )
-    rows = np.stack([table.values(name) for name in _COLUMNS], axis=1)
+    return np.stack([table.values(name) for name in _COLUMNS], axis=1)
+
+
+def score_of(contest: Contest, robot: str, trajectory: Path) -> tuple[float, float]:
+    """Return a trajectory's score by the contest's rules on the machine, and the same of a run of any length."""
+    return score_of_rows(contest, robot, trajectory_rows(trajectory))
+
+
+def score_of_rows(contest: Contest, robot: str, rows: Array, *, simulated: bool = False) -> tuple[float, float]:
+    """Return both scores of :func:`score_of`; of a ``simulated`` run by the simulation's norms."""
     times, states, efforts, plant = rows[:, 0], rows[:, 1:5], rows[:, 5:], benchmark_plant(robot)
     if contest.version == "v3":
         return (time_above_line(plant, times, states) / contest.duration,) * 2
     criteria, end = criteria_of(plant, times, states, efforts), float(times[-1])
-    norms = _PERTURBED if (contest.folder, robot) == ("real_system_perturbed", "acrobot") else CRITERIA_HARDWARE
+    norms = CRITERIA if simulated else dict(contest.norms).get(robot, CRITERIA_HARDWARE)
     score = score_v1(criteria, end) if contest.version == "v1" else score_v2(criteria, end, norms)
     return score if end >= _WHOLE * contest.duration else 0.0, score
 
@@ -149,7 +163,7 @@ def read_trials(data: Path) -> list[Trial]:
         name = "scores.csv" if contest.version == "v1" else f"scores_{contest.version}.csv"
         for robot in BENCHMARK_PLANTS:
             for file in sorted((data / "data" / robot / contest.folder).glob(f"*/experiment*/{name}")):
-                published, trajectory = _published(file), file.with_name("trajectory.csv")
+                published, trajectory = published_score(file), file.with_name("trajectory.csv")
                 of_rules, of_any = score_of(contest, robot, trajectory) if trajectory.is_file() else (None, published)
                 short = of_rules is not None and abs(of_rules - of_any) > TOLERANCE >= abs(of_any - published)
                 reason = f"up at its end before {contest.duration:g} s: published as a success, none by the rules"
@@ -167,7 +181,8 @@ def _name(file: Path, part: int) -> str:
     return _ALIASES.get(file.parts[part], file.parts[part])
 
 
-def _published(file: Path) -> float:
+def published_score(file: Path) -> float:
+    """Return the score that a file of the leaderboard states."""
     try:
         return float(next(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))["RealAI Score"])
     except (StopIteration, KeyError, TypeError, ValueError) as error:
@@ -198,7 +213,7 @@ def _simulated(folder: Path, contest: Contest, robot: str, criterion: str) -> di
         }
     if criterion == _NORMS:
         return {name: score_of(contest, robot, file)[0] for name, file in files.items()}
-    return {name: _published(file) for name, file in files.items()}
+    return {name: published_score(file) for name, file in files.items()}
 
 
 def _comparison(criterion: str, trials: Sequence[Trial], simulated: dict[str, float]) -> Comparison:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -17,8 +17,9 @@ from pendulum_bags.pages.layer_page import write_layer_page
 from pendulum_bags.ranking.ranking import Ranking
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_bags.studies.real_ai_gym import SIMULATED, TOLERANCE, Comparison, Trial
+from pendulum_bags.studies.real_ai_gym_policies import BOARD_TOLERANCE, BoardRow, PredictionRow
 
-__all__ = ["study_tables", "study_text", "to_json", "write_study"]
+__all__ = ["Study", "study_tables", "study_text", "to_json", "write_study"]
 
 _NOTES = """Intervals are of 95 %. Those of regret, scores and Spearman's correlation cover trials repeated on the
 machine as it was at the contest, by Student's t; that of Pearson's covers other controllers, that of MMRV both. None
@@ -30,8 +31,18 @@ A controller on the machine may be another training under the same name (AR-EAPO
 friction): the study judges what the published simulation would have selected, not its physics alone."""
 
 
-def study_text(trials: Sequence[Trial], found: Sequence[Comparison]) -> list[str]:
+class Study(NamedTuple):
+    """All results: trials, comparisons and, of the published controllers, rows of the board and predictions."""
+
+    trials: Sequence[Trial]
+    found: Sequence[Comparison]
+    board: Sequence[BoardRow] = ()
+    predictions: Sequence[PredictionRow] = ()
+
+
+def study_text(study: Study) -> list[str]:
     """Return what the study shows, as sentences: scores reproduced, how often the simulation picks the best, limits."""
+    trials, found = study.trials, study.found
     computed = [one for one in trials if one.computed is not None]
     differing = [one for one in computed if abs(one.score - one.published) > TOLERANCE]
     largest = max((abs(one.score - one.published) for one in computed if one not in differing), default=0.0)
@@ -57,13 +68,19 @@ def study_text(trials: Sequence[Trial], found: Sequence[Comparison]) -> list[str
             f"{sum(1.0 / len(one.names) for one in ranked):.1f}; of {sum(one.pairs for one in ranked)} pairs "
             f"{len(wrong)} are in the wrong order, {sum(pair.sure for pair in wrong)} of them surely."
         )
+    if study.board:
+        same = sum(abs(one.computed - one.published) <= BOARD_TOLERANCE for one in study.board)
+        text.append(
+            f"{same} of {len(study.board)} controllers of the simulation's board score here within {BOARD_TOLERANCE} "
+            "of what was published."
+        )
     return [*text, f"Not ranked, with fewer than 3 controllers: {', '.join(few) or 'none'}.", _NOTES]
 
 
-def study_tables(found: Sequence[Comparison]) -> list[Table]:
-    """Return the table of the comparisons, and that of the pairs in the wrong order."""
+def study_tables(study: Study) -> list[Table]:
+    """Return the tables: comparisons, pairs in the wrong order, and what the published controllers do."""
     rows, wrong = [], []
-    for one in found:
+    for one in study.found:
         if (ranking := one.ranking) is None:
             continue
         of = (f"{one.contest.name}, {one.robot}", one.criterion)
@@ -83,9 +100,52 @@ def study_tables(found: Sequence[Comparison]) -> list[Table]:
     )
     pairs = ("contest", "by", "simulation prefers", "machine prefers", "in simulation by", "on machine by", "sure")
     sure = "Sure: beyond the scatter of the trials, at most 5 % of them falsely in the mean (Benjamini and Hochberg)."
-    return [
+    tables = [
         Table("Would the simulation have picked the best controller?", sentence, head, rows),
         Table("Pairs in the wrong order", sure, pairs, wrong),
+    ]
+    return [*tables, *(_policy_tables(study) if study.board or study.predictions else ())]
+
+
+def _policy_tables(study: Study) -> list[Table]:
+    elsewhere = list(study.board[0].elsewhere) if study.board else []
+    board = [
+        (
+            f"{one.controller}, {one.robot}",
+            f"{one.published:.4f}",
+            f"{one.computed:.4f}",
+            *(f"{one.elsewhere[plant]:.3f}" for plant in elsewhere),
+        )
+        for one in study.board
+    ]
+    predictions = [
+        (
+            f"{one.robot}, {one.plant}",
+            f"{one.difference:.1g}",
+            f"{np.mean(one.machine):.3f}",
+            *(
+                f"{np.mean(one.predicted[kind]):.3f}" if kind in one.predicted else "-"
+                for kind in ((True, True), (True, False), (False, True), (False, False))
+            ),
+        )
+        for one in study.predictions
+    ]
+    return [
+        Table(
+            "Controllers of the simulation's board, simulated again",
+            "Published score v2, that of a run here in the contests' plant, and in each further plant the score by "
+            "the machine's norms, without perturbations and delay.",
+            ("controller", "published", "here", *(f"in {plant}" for plant in elsewhere)),
+            board,
+        ),
+        Table(
+            "What a plant predicts of MC-PILCO on the machine",
+            "Its published file gives the torques that its trials logged, up to the rms difference shown. Mean score "
+            "of the trials, and of as many simulated ones with the same perturbations: with the plant's friction and "
+            "the control period (30 ms) by which the machine acted later, or without one or both.",
+            ("robot, plant", "difference [N m]", "machine", "friction and delay", "friction", "delay", "neither"),
+            predictions,
+        ),
     ]
 
 
@@ -129,10 +189,20 @@ def _panel(one: Comparison, ranking: Ranking, trials: Sequence[Trial]) -> Panel:
     return Panel(x_label, "", traces, title=title, y_ticks=ticks, y_range=(-0.5, len(names) - 0.4))
 
 
-def to_json(trials: Sequence[Trial], found: Sequence[Comparison]) -> dict[str, Any]:
+def to_json(study: Study) -> dict[str, Any]:
     """Return the study as JSON values."""
+    trials, found = study.trials, study.found
+    predictions = [
+        {
+            **one._asdict(),
+            "predicted": [{"friction": f, "delay": d, "scores": v} for (f, d), v in one.predicted.items()],
+        }
+        for one in study.predictions
+    ]
     return {
-        "text": study_text(trials, found),
+        "text": study_text(study),
+        "board": [one._asdict() for one in study.board],
+        "predictions": predictions,
         "comparisons": [
             {**one._asdict(), "contest": one.contest._asdict(), "ranking": one.ranking and one.ranking.to_json()}
             for one in found
@@ -141,10 +211,10 @@ def to_json(trials: Sequence[Trial], found: Sequence[Comparison]) -> dict[str, A
     }
 
 
-def write_study(folder: Path, trials: Sequence[Trial], found: Sequence[Comparison]) -> Path:
+def write_study(folder: Path, study: Study) -> Path:
     """Write numbers, figures and page into a folder; return the page."""
-    write_json(folder / "real_ai_gym.json", to_json(trials, found))
-    figures, tables, text = study_figures(trials, found), study_tables(found), study_text(trials, found)
+    write_json(folder / "real_ai_gym.json", to_json(study))
+    figures, tables, text = study_figures(study.trials, study.found), study_tables(study), study_text(study)
     write_figures(figures, folder / "figures")
     title = "Would the contests' simulation have picked the right controller?"
     return write_layer_page(folder / "real_ai_gym.html", title, [], figures, tables, text)
