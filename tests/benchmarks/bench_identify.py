@@ -268,7 +268,7 @@ def _double_pendulum_of_two_joints() -> Iterator[Row]:
     targets = (0.0065, 0.0085, 0.012, 0.015)
     plain = (0.0075, 0.0118, 0.0222, 0.0288)
     for i, (log, target, least) in enumerate(zip(logs, targets, plain, strict=True)):
-        result = identify_joints(start, [*logs[:i], *logs[i + 1 :]], stride=4)
+        result = identify_joints(start, [*logs[:i], *logs[i + 1 :]])
         yield measured(
             f"double pendulum, {log.name} by the other three records",
             error(result.model, log, result.fit.own),

@@ -315,9 +315,9 @@ def _print_thesis(result: ThesisResult, *, verbose: bool) -> None:
         print(_narrow(regression.summary))
 
 
-def _narrow(summary: str, width: int = 78) -> str:
+def _narrow(summary: str) -> str:
     """Remove blanks from the head of statsmodels' summary, which its labels widened."""
-    lines = [line.rstrip() for line in summary.splitlines()]
+    lines, width = [line.rstrip() for line in summary.splitlines()], 78
     rules = [index for index, line in enumerate(lines) if line and not line.strip("=")]
     excess = len(lines[rules[0]]) - width if len(rules) > 1 else 0
     if excess > 0:

@@ -161,15 +161,13 @@ def ask_yes(machine: RealMachine, plan: str, console: Console, *, yes: bool, rea
     _ask(console, moves, plan, f"{machine.effort_limit}. Keep a hand on the motion stop", yes=yes, read=read)
 
 
-def ask_for_running(
-    places: Sequence[str], domain: int, plan: str, *, yes: bool, read: Callable[[], str] = input
-) -> None:
+def ask_for_running(places: Sequence[str], domain: int, plan: str, *, yes: bool) -> None:
     """Ask before moving running plants, whose hardware is unknown; a FaultError without confirmation."""
     if not places:
         return
     console = make_console(stderr=True, highlight=False)
     moves = f"what runs already in {' and '.join(places)} on ROS domain {domain}: it may be a REAL machine"
-    _ask(console, moves, plan, "what that plant allows. Keep a hand on its motion stop", yes=yes, read=read)
+    _ask(console, moves, plan, "what that plant allows. Keep a hand on its motion stop", yes=yes, read=input)
 
 
 def _ask(console: Console, moves: str, plan: str, limit: str, *, yes: bool, read: Callable[[], str]) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 from threadpoolctl import threadpool_limits
@@ -63,11 +63,9 @@ def write_analysis(
     folder: Path,
     analysis: Analysis,
     formats: Sequence[str] = ("png", "pdf"),
-    step: Callable[[str], None] = lambda _: None,
 ) -> Path:
-    """Write responses, layers, numbers, figures and a page; ``step`` gets each name; return the page."""
+    """Write responses, layers, numbers, figures and a page; return the page."""
     write_numbers(folder, analysis)
-    step("drawing")
     # Thousands of small matrices: BLAS threads only slow them down.
     with threadpool_limits(1):
         figures = name_in(response_figures(analysis), emulated=analysis.is_emulated)

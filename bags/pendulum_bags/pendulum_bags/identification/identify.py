@@ -184,7 +184,6 @@ def identify_joints(
     held_out: Sequence[JointRecording] = (),
     window: float | None = None,
     extras: str | None = None,
-    stride: int = 1,
 ) -> IdentificationResult:
     """Identify a mechanism by output error and judge the result.
 
@@ -195,18 +194,17 @@ def identify_joints(
         window: Length of the windows [s]; by default a sixth of the data, between 0.5 and 5 s, or what
             neighbouring motions stay together for.
         extras: One of ``EXTRAS``; None lets held-out windows choose.
-        stride: Take every n-th position.
 
     Raises:
         DataError: A recording is too short, of other joints, or one joint of it does not move.
     """
     if plant.coordinates.volts:
         fitted, kept = ([each.at_standstill(plant) for each in some] for some in (recordings, held_out))
-        options: Any = {"held_out": kept, "window": window, "extras": extras, "stride": stride}
+        options: Any = {"held_out": kept, "window": window, "extras": extras}
         return _behind_motors(plant, identify_joints(plant.torque_plant, fitted, **options))
     return identify_motions(
         JointModel.of(plant), recordings, IdentificationResult, undetermined_joints,
-        held_out=held_out, window=window, extras=extras, stride=stride,
+        held_out=held_out, window=window, extras=extras,
     )  # fmt: skip
 
 
@@ -220,7 +218,6 @@ def identify_motions(
     held_out: Sequence[JointRecording] = (),
     window: float | None = None,
     extras: str | None = None,
-    stride: int = 1,
 ) -> R:
     """Identify any simulation of joints as :func:`identify_joints` does.
 
@@ -229,11 +226,11 @@ def identify_motions(
     for recording in (*recordings, *held_out):
         recording.check(start.coordinates)
     check_distinct(recordings, held_out)
-    best = search(start, recordings, window, extras, stride)
+    best = search(start, recordings, window, extras)
     found, held = hold_undetermined(best.fit)
     names = distinct_names([*recordings, *held_out])
     training = dict(zip(names, found.scores, strict=False))
-    others = [prepare_windows(recording, best.length, stride=stride) for recording in held_out]
+    others = [prepare_windows(recording, best.length) for recording in held_out]
     outside = dict(
         zip(names[len(recordings) :], joint_scores(found.model, others, found.weights, own=found.own), strict=True)
     )

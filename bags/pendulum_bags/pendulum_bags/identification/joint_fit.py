@@ -134,12 +134,12 @@ class Windows:
         return np.concatenate((mean - half, 2.0 * half / length), axis=2)
 
 
-def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1) -> Windows:
-    """Cut a recording into windows of a length [s], of every ``stride``-th sample; the mean effort drives each step."""
+def prepare_windows(recording: JointRecording, window: float) -> Windows:
+    """Cut a recording into windows of a length [s]; the mean effort drives each step."""
     # What was commanded before the recording acts on in its first moments.
     begin = int(np.searchsorted(recording.time, recording.time[0] + _BEFORE))
     cuts = begin + cut_windows(recording.time[begin:], window)
-    parts = [np.arange(first, stop, stride) for first, stop in cuts]
+    parts = [np.arange(first, stop) for first, stop in cuts]
     # No window reaches across a gap.
     period, longest = recording.period, longest_step(recording.time)
     steps = np.diff(recording.time)
@@ -150,7 +150,7 @@ def prepare_windows(recording: JointRecording, window: float, *, stride: int = 1
             "higher rate"
         )
     longest = _LONGEST if recording.velocity is None else _FINE
-    several = max(1, math.ceil(stride * period / longest - 1e-6))
+    several = max(1, math.ceil(period / longest - 1e-6))
     size = (max(part.size for part in parts) - 1) * several + 1
     time, inside = np.empty((len(parts), size)), np.zeros((len(parts), size), dtype=bool)
     position = np.zeros((len(parts), size, recording.position.shape[1]))

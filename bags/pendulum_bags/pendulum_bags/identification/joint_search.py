@@ -182,9 +182,7 @@ class Found:
     pushed: Sequence[tuple[str, float, float]] = ()
 
 
-def search(
-    start: MotionModel, recordings: Sequence[JointRecording], window: float | None, extras: str | None, stride: int
-) -> Found:
+def search(start: MotionModel, recordings: Sequence[JointRecording], window: float | None, extras: str | None) -> Found:
     """Return the best fit to recordings; arguments as of :func:`identify_joints`.
 
     Raises:
@@ -192,10 +190,10 @@ def search(
     """
     measured = all(recording.velocity is not None for recording in recordings)
     length, longest = default_window(start, recordings) if window is None else (window, window)
-    if extras is None and measured and all(recording.period * stride <= _FAST for recording in recordings):
+    if extras is None and measured and all(recording.period <= _FAST for recording in recordings):
         # Measured to their velocity, the recordings show these: left out, they would bias what is left.
         extras = ALL_EXTRAS
-    best = _Search(start, recordings, extras, stride).best(length, fixed=window is not None)
+    best = _Search(start, recordings, extras).best(length, fixed=window is not None)
     found, pushed = _without_pushes(best.fit)
     # Now that the errors are known, each measurement counts by its own; of a fit to be refused none does.
     for _ in range(0 if found.worst > LARGEST_SHARE else 2 if measured else 1):
@@ -218,7 +216,6 @@ class _Search:
     start: MotionModel
     recordings: Sequence[JointRecording]
     extras: str | None
-    stride: int
 
     def best(self, length: float, *, fixed: bool) -> Found:
         """Return the best fit to windows of a length [s], or to shorter ones unless it is fixed.
@@ -267,7 +264,7 @@ class _Search:
         return None if best == start[DELAY] else models[best]
 
     def _windows(self, length: float) -> list[Windows]:
-        data = [prepare_windows(recording, length, stride=self.stride) for recording in self.recordings]
+        data = [prepare_windows(recording, length) for recording in self.recordings]
         total = sum(len(part.time) for part in data)
         if total < _FEWEST:
             raise DataError(

@@ -55,22 +55,19 @@ class Options:
         friction: ``auto`` or one of ``FRICTION_MODELS``.
         geometry: Known mass, length, inertia.
         fix_scale: Whether a known m g l fixes the scale of torque (else it is only checked against).
-        delay, angle_offset, torque_offset: Whether each is fitted.
+        angle_offset, torque_offset: Whether each is fitted.
         multi_start: Whether to search from several starts.
         folds: Most folds of the cross-validation.
-        robust: Whether to use the soft-L1 loss.
     """
 
     window: float | None = None
     friction: str = "auto"
     geometry: Geometry = Geometry()
     fix_scale: bool = False
-    delay: bool = True
     angle_offset: bool = True
     torque_offset: bool = True
     multi_start: bool = True
     folds: int = 6
-    robust: bool = True
 
     def __post_init__(self) -> None:
         if self.window is not None and not (np.isfinite(self.window) and self.window > 0.0):

@@ -96,7 +96,7 @@ def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULT
     models = first_models(longest, fixed, base, spread=options.multi_start)
     # Ranked twice: by a loss that can pull from far, and by one that a single pushed window cannot sway.
     starts = [start for scale in (0.3, 0.03) for start in rank(models, pieces, base, scale=scale, keep=2)]
-    best, scale = _anneal(starts, pieces, base, options.robust)
+    best, scale = _anneal(starts, pieces, base)
     best, pieces, zeros = align(best, pieces, base, window, scale, coarse=COARSE)
     if zeros is not None:
         scale = _robust_scale(best, pieces)
@@ -177,7 +177,7 @@ def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel,
         free.append("torque_offset")
     if options.angle_offset:
         free.append("angle_offset")
-    if options.delay and varies:
+    if varies:
         free.append("transport_delay")
     return FitModel(values, kind, "coulomb", duty_gain), tuple(free)
 
@@ -210,13 +210,8 @@ def _duty_gain(recording: Recording) -> float:
     return float(np.median(slopes) / kp) if slopes.size > 10 else 0.0025
 
 
-def _anneal(
-    starts: Sequence[Solution], pieces: Sequence[Piece], free: Sequence[str], robust: bool
-) -> tuple[Solution, float]:
+def _anneal(starts: Sequence[Solution], pieces: Sequence[Piece], free: Sequence[str]) -> tuple[Solution, float]:
     """Return the best fit and the scale of its loss, tightened step by step so that a push by hand loses its pull."""
-    if not robust:
-        finals = [solve(s.model, pieces, free, tolerance=1e-7, coarse=COARSE) for s in starts]
-        return min(finals, key=lambda s: s.cost), np.inf
     finalists = []
     for start in starts:
         for first_scale in (0.3, 0.03):

@@ -98,7 +98,6 @@ def _quick(
     window: float | None,
     *,
     whole: Solution | None = None,
-    spread: bool = False,
 ) -> tuple[float, Solution | None]:
     """Return what share a fit misses, and the fit: to some windows, or from that to all of them."""
     try:
@@ -109,7 +108,7 @@ def _quick(
         longest = max((piece.recording for piece in every), key=lambda r: r.duration)
         stride = max(1, sum(len(piece.windows) for piece in every) // _FEW)
         few = [piece.subset(range(0, len(piece.windows), stride)) for piece in every]
-        start = rank(first_models(longest, fixed, free, spread=spread), few, free, keep=1)[0]
+        start = rank(first_models(longest, fixed, free, spread=False), few, free, keep=1)[0]
         found = solve(
             start.model, few, free, states=start.states, scale=0.3, tolerance=1e-3, max_iterations=15, coarse=3.0
         )

@@ -23,6 +23,9 @@ INCOMPLETE = "MODEL INCOMPLETE"
 """How the sentence begins that no interval covers what the model lacks."""
 
 
+_LAGS = 25
+"""Largest lag of a correlation [samples]."""
+
 _NOTHING = 1e-4
 """Error of a fit over that of straight lines below which nothing is missing, whatever what is left looks like."""
 
@@ -60,8 +63,8 @@ class ResidualTests:
     incomplete: bool = False
 
 
-def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
-    """Test the residuals of a fit up to some lags [samples]; no product reaches across windows.
+def residual_tests(fit: OutputErrorFit) -> ResidualTests:
+    """Test the residuals of a fit up to ``_LAGS`` samples; no product reaches across windows.
 
     Whether they depend on the input or on the motion is asked by sums over blocks that are longer than the residuals
     are correlated: correlated noise alone does not make such a dependence.
@@ -83,7 +86,7 @@ def residual_tests(fit: OutputErrorFit, *, lags: int = 25) -> ResidualTests:
             inputs.append(drive[first:stop])
             rms.append(float(np.sqrt(np.mean(r**2))))
             labels.append((name, float(time[first] - time[0]), float(time[stop - 1] - time[0])))
-    lags = min(lags, min(len(s) for s in segments) - 2)
+    lags = min(_LAGS, min(len(s) for s in segments) - 2)
     auto = _correlation(segments, segments, lags)[lags:]
     cross = _correlation(inputs, segments, lags)
     samples = sum(len(s) for s in segments)

@@ -21,11 +21,14 @@ from pendulum_msgs_py.errors import DataError
 
 __all__ = ["bumps", "equation_error", "equation_residual", "first_models", "rank"]
 
+_BUMP = 0.2
+"""Length of the modulating functions [s]."""
+
 _CONSTANT = 0.1
 """Spread of an input, as a share of its mean, below which it is taken as constant."""
 
 
-def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
+def equation_error(recording: Recording, *, window: float = _BUMP) -> Array:
     """Return least-squares (J, b, c, G, offset) of J th'' + b th' + c sgn th' + G sin th - offset = u, shape (5,).
 
     Both sides are multiplied by a bump of length ``window`` [s] that vanishes with its derivatives at both ends and
@@ -47,12 +50,12 @@ def equation_error(recording: Recording, *, window: float = 0.2) -> Array:
     return np.asarray(np.linalg.lstsq(columns, drive, rcond=None)[0], np.float64)
 
 
-def equation_residual(recording: Recording, *, window: float = 0.2) -> tuple[float, float]:
+def equation_residual(recording: Recording) -> tuple[float, float]:
     """Return what :func:`equation_error` leaves over with any zero of the angle, and where that zero lies [rad].
 
     The rest is rms over rms, of the filtered input or, in a free swing, of the filtered acceleration.
     """
-    columns, drive = _filtered_equation(recording, window)
+    columns, drive = _filtered_equation(recording, _BUMP)
     if recording.input_kind == "none":
         columns, drive = columns[:, 1:], -columns[:, 0]
     found = np.linalg.lstsq(columns, drive, rcond=None)[0]

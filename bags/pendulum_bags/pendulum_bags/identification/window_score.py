@@ -84,18 +84,16 @@ def fit_states(model: FitModel, piece: Piece) -> Array:
     return np.concatenate(states)
 
 
-def free_run(
-    model: FitModel | PlantParameters, recording: Recording, *, settle: float = 1.0, fitted: bool = True
-) -> WindowScore:
+def free_run(model: FitModel | PlantParameters, recording: Recording, *, fitted: bool = True) -> WindowScore:
     """Simulate a whole recording from one initial state, never corrected by the measurement again.
 
-    The state is fitted to a first stretch, ``settle`` [s], or, unless ``fitted``, the first one measured.
+    The state is fitted to the first second, or, unless ``fitted``, the first one measured.
     """
     fit_model = from_plant(model) if isinstance(model, PlantParameters) else model
     piece = prepare(recording, None, across_gaps=True)
     states = piece.states.copy()
     if fitted:
-        stop = int(np.searchsorted(recording.time, recording.time[0] + settle))
+        stop = int(np.searchsorted(recording.time, recording.time[0] + 1.0))
         head = Piece(recording, np.array([[0, max(stop, 4)]], dtype=np.int64), states, piece.integral, piece.enabled)
         states = solve(fit_model, [head], (), max_iterations=40).states[0]
     elif recording.velocity is not None:

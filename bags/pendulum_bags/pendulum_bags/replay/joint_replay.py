@@ -93,7 +93,6 @@ def replay_joints(
     plant: str | PlantParameters,
     *,
     window: float = 1.0,
-    mapping: str | None = None,
 ) -> JointReplay:
     """Drive a plant of several joints with the efforts of a recording, in windows [s].
 
@@ -102,7 +101,7 @@ def replay_joints(
     if not window > 0.0:
         raise DataError(f"window is {window} s; expected > 0")
     own = load_mechanism(plant) if isinstance(plant, str) else plant
-    recording = read_joints(path, own.coordinates, mapping).at_standstill(own)
+    recording = read_joints(path, own.coordinates).at_standstill(own)
     recording.check(own.coordinates)
     lag = max((actuator.time_constant for actuator in own.actuators), default=0.0)
     model = JointModel.of(own.torque_plant).with_changes({DELAY: common_delay(own), LAG: lag})

@@ -224,8 +224,8 @@ def distributions(data: ReportData) -> Figure:
     )
 
 
-def _distribution(values: Array, most: int = 400) -> tuple[Array, Array]:
-    levels = np.linspace(0.0, 1.0, min(most, values.size))
+def _distribution(values: Array) -> tuple[Array, Array]:
+    levels = np.linspace(0.0, 1.0, min(400, values.size))
     return np.quantile(values, levels), levels
 
 
