@@ -98,7 +98,7 @@ def test_lockstep_runs_of_a_policy_on_the_emulated_hardware_with_one_seed_are_id
     # In one domain: what is left of the first run would be counted among those who hear the second.
     for name, seed in (("other", 6), ("in_the_same_processes", 5)):
         settings = RegulationSettings(controller=str(path), noise=NoiseSettings(seed=seed, duration=1.0))
-        spec = lockstep.lockstep_spec(settings, side="hw")
+        spec = settings.run("hw")
         lockstep.record_run(tmp_path / name, spec, domain=domain_id, hosts=hosts)
         ran_in.append(dict(pids))
     assert ran_in[0] == ran_in[1]
@@ -196,7 +196,7 @@ def test_a_run_of_which_the_recorder_received_nothing_on_a_topic_fails_and_names
     monkeypatch.setattr(RecorderClient.wait_for_all, "__defaults__", (3.0,))
     # The recorder is no listener of it.
     monkeypatch.setitem(lockstep._RUN_LISTENERS, "disturbance", 1)
-    spec = lockstep.lockstep_spec(RegulationSettings(noise=NoiseSettings(duration=0.2)), side="sim")
+    spec = RegulationSettings(noise=NoiseSettings(duration=0.2)).run("sim")
     with pytest.raises(FaultError, match=r"the recorder has 0 of 100 messages of /sim/disturbance after 3 s"):
         lockstep.record_run(tmp_path / "run", spec, hosts=hosts)
 

@@ -14,7 +14,6 @@ from pendulum_bags.comparison import Margins, Outcome, compare_folders, read_run
 from pendulum_bags.experiments.deadline import BudgetSpentError, Deadline
 from pendulum_bags.experiments.decide import decide
 from pendulum_bags.experiments.in_process import simulate
-from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.repeats import (
     record_simulation,
     repeat_folder,
@@ -170,7 +169,7 @@ def test_repeats_have_noise_of_their_own_and_twice_as_much_each_time() -> None:
 
 
 def test_a_simulation_in_this_process_is_kept_as_its_recorder_would_keep_it(tmp_path: Path) -> None:
-    spec = lockstep_spec(SETTINGS, side="sim")
+    spec = SETTINGS.run("sim")
     arrays = simulate(spec)
     run = read_run(record_simulation(tmp_path / "sim", spec))
     np.testing.assert_array_equal(run.window.position, arrays.position[:-1])

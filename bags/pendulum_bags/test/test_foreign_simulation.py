@@ -15,7 +15,6 @@ from pendulum_bags.comparison import Outcome, compare_runs
 from pendulum_bags.comparison.independence import check_pairs
 from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.joint_run import JointSettings
-from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.repeats import record_repeat, record_simulation, repeat_folder
 from pendulum_bags.experiments.settings import NoiseSettings, RegulationSettings
 from pendulum_bags.experiments.simulation import ForeignSimulation, recorded_difference
@@ -44,8 +43,8 @@ def test_the_controller_is_designed_on_what_the_model_says(model: Path, tmp_path
 
 
 def test_a_model_with_our_parameters_moves_like_our_simulation(model: Path) -> None:
-    ours = simulate(lockstep_spec(RegulationSettings(noise=SHORT, method="etd4"), side="sim"))
-    theirs = simulate(lockstep_spec(RegulationSettings(noise=SHORT, simulation=str(model)), side="sim"))
+    ours = simulate(RegulationSettings(noise=SHORT, method="etd4").run("sim"))
+    theirs = simulate(RegulationSettings(noise=SHORT, simulation=str(model)).run("sim"))
     assert np.array_equal(theirs.disturbance, ours.disturbance)
     assert np.max(np.abs(theirs.position - ours.position)) < 0.1 * np.std(ours.position)
 
@@ -56,10 +55,10 @@ def test_two_simulations_of_one_plant_are_equivalent_and_of_two_plants_are_not(
 ) -> None:
     noise = NoiseSettings(duration=5.0)
     theirs = RegulationSettings(noise=noise, simulation=str(model) if kind == "mujoco" else "gymnasium:PendulumX59-v0")
-    record_simulation(tmp_path / "theirs", lockstep_spec(theirs, side="sim"))
+    record_simulation(tmp_path / "theirs", theirs.run("sim"))
     for damping, outcome in ((11.77, Outcome.EQUIVALENT), (6.0, Outcome.DIFFERENT)):
         plant = write_plant(tmp_path / f"{damping}.yaml", load_plant("thesis").with_values(damping=damping))
-        spec = replace(lockstep_spec(RegulationSettings(noise=noise, method="etd4"), side="sim"), plant=str(plant))
+        spec = replace(RegulationSettings(noise=noise, method="etd4").run("sim"), plant=str(plant))
         ours = record_simulation(tmp_path / f"ours_{damping}", spec)
         assert compare_runs(tmp_path / "theirs", ours).verdict.outcome is outcome
 
@@ -70,10 +69,10 @@ def test_the_node_has_our_simulators_name_and_absolute_paths(model: Path, monkey
     program = settings.simulator_program()
     assert (program.full_name, program.executable) == ("/sim/simulator", "mujoco")
     assert program.parameters == {"model": str(model), "clock": "realtime"}
-    in_lockstep = lockstep_spec(settings, side="sim").plant_program(4)
+    in_lockstep = settings.run("sim").plant_program(4)
     assert in_lockstep.full_name == "/sim/simulator"
     assert "plant" not in in_lockstep.parameters
-    assert lockstep_spec(settings, side="hw").foreign is None
+    assert settings.run("hw").foreign is None
 
 
 @pytest.mark.parametrize(
@@ -130,7 +129,7 @@ def test_a_difference_that_was_accepted_stands_beside_the_figures(model: Path, s
     bags = []
     for path in (stopped, model):
         settings = RegulationSettings(noise=SHORT, simulation=str(path))
-        bags.append(record_simulation(tmp_path / path.stem, lockstep_spec(settings, side="sim")))
+        bags.append(record_simulation(tmp_path / path.stem, settings.run("sim")))
     (note,) = compare_runs(*bags).notes
     assert note.startswith("The simulation, stopped.xml, does not move as its equation")
     assert compare_runs(bags[1], bags[0]).notes == []
@@ -138,7 +137,7 @@ def test_a_difference_that_was_accepted_stands_beside_the_figures(model: Path, s
 
 @pytest.mark.parametrize(("damping", "verb"), [(11.77, "It agrees with"), (6.0, "It DIFFERS FROM")])
 def test_a_plant_that_cannot_be_reset_is_checked_by_its_recording(tmp_path: Path, damping: float, verb: str) -> None:
-    bag = record_simulation(tmp_path / "bag", lockstep_spec(RegulationSettings(noise=SHORT, method="etd4"), side="sim"))
+    bag = record_simulation(tmp_path / "bag", RegulationSettings(noise=SHORT, method="etd4").run("sim"))
     plant = write_plant(tmp_path / "believed.yaml", load_plant("thesis").with_values(damping=damping))
     told = recorded_difference(bag, "/sim", str(plant))
     assert verb in told

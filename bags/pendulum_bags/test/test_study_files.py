@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from pendulum_bags.experiments.in_process import simulate
-from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.studies.results import group_runs, groups_to_json
@@ -214,5 +213,5 @@ def test_a_run_is_of_a_plant_by_its_values_and_not_by_the_name_of_its_file(tmp_p
     # The experiment in real time is of the same plants as its repeats in lockstep.
     settings = RegulationSettings(plant=str(other))
     for side in ("sim", "hw"):
-        assert settings.identity(side) == lockstep_spec(settings, side=side).identity
+        assert settings.identity(side) == settings.run(side).identity
         assert settings.metadata("thesis", side=side)["pendulum.run"]["identity"] == settings.identity(side)

@@ -15,7 +15,6 @@ import pytest
 from pendulum_bags.comparison import Margins
 from pendulum_bags.experiments.deadline import BudgetSpentError, Deadline
 from pendulum_bags.experiments.in_process import simulate
-from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.machine import Machine, MachineRun, record_listed
 from pendulum_bags.experiments.progress import PhaseProgress
 from pendulum_bags.experiments.repeats import record_simulation, record_spec
@@ -115,7 +114,7 @@ def test_two_simulations_are_not_repeated_in_advance_since_they_may_be_one(tmp_p
     assert repeats == [True, False]
     # The identified plant runs as a simulator of ours, under the controller of the given one and under other noise.
     file = write_plant(tmp_path / "plant.yaml", load_plant("thesis").with_values(inertia=0.2))
-    spec, given = (lockstep_spec(one, side="sim") for one in (carry_out._with_plant(run.tested, file), settings))
+    spec, given = (one.run("sim") for one in (carry_out._with_plant(run.tested, file), settings))
     assert (spec.plant, spec.simulation) == (str(file), "")
     assert spec.design_plant == given.design_plant == "thesis"
     assert spec.seed != given.seed
@@ -125,7 +124,7 @@ def test_an_identified_plant_runs_under_the_controller_of_the_given_one(tmp_path
     file = write_plant(tmp_path / "plant.yaml", load_plant("thesis").with_values(inertia=0.2))
     noise = NoiseSettings(duration=0.5)
     settings = RegulationSettings(plant=str(file), design="thesis", noise=noise)
-    spec = lockstep_spec(settings, side="sim")
+    spec = settings.run("sim")
     assert (spec.plant, spec.design_plant) == (str(file), "thesis")
     assert settings.controller_program("/sim").parameters["plant"] == "thesis"
     run = read_run(record_simulation(tmp_path / "sim", spec))

@@ -121,25 +121,8 @@ class JointSettings(Sides):
 
     def run(self, side: str) -> RunSpec:
         """Return one side as a run in lockstep, for as long as the noise lasts."""
-        noise, foreign = self.noise, self.foreign_of(side)
-        return RunSpec(
-            side=side,
-            plant=self.plant_of(side),
-            design_plant=self.design_plant,
-            controller=self.controller,
-            disturbance={
-                "kind": "uniform",
-                "joints": [self.joint],
-                "amplitude": noise.amplitude,
-                "hold_time": noise.hold_time,
-                "duration": noise.duration,
-            },
-            duration=noise.duration,
-            seed=noise.seed,
-            storage=self.storage,
-            simulation="" if foreign is None else foreign.name,
-            mapping="" if foreign is None else foreign.mapping,
-        )
+        own = {"plant": self.plant_of(side), "design_plant": self.design_plant, "controller": self.controller}
+        return self._run(side, {"joints": [self.joint]}, **own)
 
     def metadata(self, side: str) -> dict[str, Any]:
         """Return the metadata of the bag of a side that runs already."""

@@ -27,7 +27,7 @@ from pendulum_msgs_py.contract.names import Event
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import FaultError
 
-__all__ = ["lockstep_spec", "longest_run", "record_run", "run_lockstep"]
+__all__ = ["longest_run", "record_run", "run_lockstep"]
 
 _LAST_WORDS = 0.2
 """Time for the recorder to receive the end of a run in real time [s]."""
@@ -54,34 +54,7 @@ def run_lockstep(
     hosts: HostPool | None = None,
 ) -> Path:
     """Run and record one side of an experiment in lockstep under noise, as :func:`record_run`."""
-    return record_run(bag, lockstep_spec(settings, side=side), domain=domain, on_wait=on_wait, hosts=hosts)
-
-
-def lockstep_spec(settings: RegulationSettings | JointSettings, *, side: str) -> RunSpec:
-    """Return one side of an experiment as a run in lockstep, for as long as the noise lasts."""
-    if isinstance(settings, JointSettings):
-        return settings.run(side)
-    noise, foreign = settings.noise, settings.foreign_of(side)
-    return RunSpec(
-        side=side,
-        plant=settings.plant if side == "sim" else "thesis",
-        design_plant=settings.design_plant,
-        strategy=settings.strategy,
-        controller=settings.kind,
-        controller_parameters=settings.tuning,
-        disturbance={
-            "kind": "uniform",
-            "amplitude": noise.amplitude,
-            "hold_time": noise.hold_time,
-            "duration": noise.duration,
-        },
-        duration=noise.duration,
-        seed=noise.seed,
-        method=settings.method,
-        storage=settings.storage,
-        simulation="" if foreign is None else foreign.name,
-        mapping="" if foreign is None else foreign.mapping,
-    )
+    return record_run(bag, settings.run(side), domain=domain, on_wait=on_wait, hosts=hosts)
 
 
 def longest_run(duration: float) -> float:

@@ -17,7 +17,7 @@ from pendulum_bags.experiments.deadline import NEVER, Deadline
 from pendulum_bags.experiments.host_pool import HostPool
 from pendulum_bags.experiments.in_process import RunArrays, simulate
 from pendulum_bags.experiments.joint_run import JointSettings
-from pendulum_bags.experiments.lockstep import lockstep_spec, record_run
+from pendulum_bags.experiments.lockstep import record_run
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.experiments.settings import RegulationSettings
 from pendulum_bags.runs.run_data import END_EVENT, START_EVENT
@@ -70,7 +70,7 @@ def record_repeat(
     for side in ("hw", "sim"):
         if not (place / side).exists():
             deadline.require(_SIMULATING * chosen.noise.duration)
-            record_spec(place / side, lockstep_spec(chosen, side=side))
+            record_spec(place / side, chosen.run(side))
 
 
 def record_spec(bag: Path, spec: RunSpec, *, hosts: HostPool | None = None) -> Path:

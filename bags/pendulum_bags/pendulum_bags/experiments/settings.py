@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from pendulum_bags.experiments.operator import RealMachine, real_machine
 from pendulum_bags.experiments.run_spec import (
     EMULATOR_PATIENCE,
     THESIS_METHOD,
+    RunSpec,
     absolute_plant,
     integrator_of,
     run_identity,
@@ -101,6 +103,27 @@ class Sides:
     mapping: str
     hardware: str
     hardware_mapping: str
+    noise: NoiseSettings
+    storage: str
+
+    def _run(self, side: str, joints: Mapping[str, Any], **own: Any) -> RunSpec:
+        noise, foreign = self.noise, self.foreign_of(side)
+        return RunSpec(
+            side=side,
+            disturbance={
+                "kind": "uniform",
+                **joints,
+                "amplitude": noise.amplitude,
+                "hold_time": noise.hold_time,
+                "duration": noise.duration,
+            },
+            duration=noise.duration,
+            seed=noise.seed,
+            storage=self.storage,
+            simulation="" if foreign is None else foreign.name,
+            mapping="" if foreign is None else foreign.mapping,
+            **own,
+        )
 
     def plant_of(self, side: str) -> str:
         """Return the preset or file of a side's simulation of several joints; empty for one."""
@@ -250,6 +273,19 @@ class RegulationSettings(Sides):
     def expected_wall_time(self) -> float:
         """Wall time of the thesis's experiment, measured on two cores [s]."""
         return TIME_WITHOUT_NOISE + self.noise.duration + 2.0 * (self.ramp_time - UPRIGHT / RAMP_SPEED)
+
+    def run(self, side: str) -> RunSpec:
+        """Return one side as a run in lockstep, for as long as the noise lasts."""
+        return self._run(
+            side,
+            {},
+            design_plant=self.design_plant,
+            plant=self.plant if side == "sim" else "thesis",
+            strategy=self.strategy,
+            controller=self.kind,
+            controller_parameters=self.tuning,
+            method=self.method,
+        )
 
     def ramp(self, start: float, goal: float) -> Trajectory:
         """Return the thesis's ramp between two positions [rad], at the speed of these settings."""

@@ -10,7 +10,6 @@ from pathlib import Path
 
 from pendulum_bags.experiments.domain import reserve_domain
 from pendulum_bags.experiments.graph_plant import join
-from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.orchestrator_node import Orchestrator, PlantClient, RecorderClient
 from pendulum_bags.experiments.processes import Child
 from pendulum_bags.experiments.progress import PhaseProgress
@@ -170,7 +169,7 @@ def _simulate_own_protocol(folder: Path, settings: RegulationSettings) -> None:
     foreign = settings.foreign
     hold_time = 0.002 if foreign is None else max(0.002, foreign.period)
     noise = replace(settings.noise, seed=settings.noise.seed + OWN_PROTOCOL_SEED_STEP, hold_time=hold_time)
-    record_simulation(folder / "sim_500hz", lockstep_spec(replace(settings, noise=noise), side="sim"))
+    record_simulation(folder / "sim_500hz", replace(settings, noise=noise).run("sim"))
 
 
 def _start_move(

@@ -24,7 +24,6 @@ from pendulum_bags.experiments.deadline import BudgetSpentError, Deadline
 from pendulum_bags.experiments.decide import decide
 from pendulum_bags.experiments.held import record_held
 from pendulum_bags.experiments.joint_run import JointSettings, design_file, require_upright
-from pendulum_bags.experiments.lockstep import lockstep_spec
 from pendulum_bags.experiments.machine import Machine, MachineRun
 from pendulum_bags.experiments.processes import Child, ProcessSet
 from pendulum_bags.experiments.progress import PhaseProgress
@@ -251,15 +250,15 @@ class _Run:
         self.contenders: dict[str, list[tuple[RunSpec, RunSpec]]] = {}
         runs: list[MachineRun] = []
         if isinstance(settings, JointSettings) and settings.hardware == "emulator":
-            runs.append(MachineRun(folder / "hw", lockstep_spec(settings, side="hw")))
+            runs.append(MachineRun(folder / "hw", settings.run("hw")))
         if not order.alone:
-            sim, hw = (lockstep_spec(settings, side=side) for side in ("sim", "hw"))
+            sim, hw = (settings.run(side) for side in ("sim", "hw"))
             # Two simulations without noise would give the same recordings in lockstep.
             if hw.has_bridge and not isinstance(settings, JointSettings):
-                first = lockstep_spec(repeat_settings(settings, 1), side="hw")
+                first = repeat_settings(settings, 1).run("hw")
                 runs.append(MachineRun(repeat_folder(folder, 1) / "hw", first))
             if IDENTIFIED in order.steps:
-                runs.append(MachineRun(folder / IDENTIFIED / "hw", lockstep_spec(self.tested, side="hw")))
+                runs.append(MachineRun(folder / IDENTIFIED / "hw", self.tested.run("hw")))
             if order.in_frequency:
                 self.multisine, machine = order.multisine.specs(sim, hw)
                 runs.append(MachineRun(folder / MULTISINE / "hw", machine))
@@ -308,7 +307,7 @@ class _Run:
         for side in SIDES:
             if (side == "sim" and settings.running("sim") is None) or settings.foreign_of(side) is not None:
                 self._phase(f"noise on {words[side]}", 0.1 * settings.noise.duration)
-                record_simulation(self.folder / side, lockstep_spec(settings, side=side))
+                record_simulation(self.folder / side, settings.run(side))
         if settings.hardware == "emulator":
             self._phase("noise on the hardware", 4.0 + 0.15 * settings.noise.duration)
             try:
@@ -351,7 +350,7 @@ class _Run:
 
     def _repeat(self, folder: Path, settings: Settings, number: int, deadline: Deadline) -> None:
         bag = repeat_folder(folder, number) / "hw"
-        run = MachineRun(bag, lockstep_spec(repeat_settings(settings, number), side="hw"))
+        run = MachineRun(bag, repeat_settings(settings, number).run("hw"))
         if run.spec.has_bridge and not bag.exists():
             with Machine(bag.parent, [run]) as machine:
                 machine.start()
@@ -433,7 +432,7 @@ class _Run:
         self.machine.wait(place / "hw", deadline)
         deadline.require(_ANALYSING)
         settings = _with_plant(self.tested, file)
-        record_simulation(place / "sim", lockstep_spec(settings, side="sim"))
+        record_simulation(place / "sim", settings.run("sim"))
         if isinstance(settings, JointSettings):
             require_upright(place, settings)
         self.found.identified = Simulated(PLANT_FILE, settings, place, self.found.given.budget)
