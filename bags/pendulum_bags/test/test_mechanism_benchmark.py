@@ -174,8 +174,8 @@ def test_a_noisy_level_holds_where_more_than_half_of_its_runs_do() -> None:
     trials = [Trial("delay", "0", Disturbances(), 0)]
     trials += [Trial("velocity_noise", level, Disturbances(), 0) for level in "ab" for _ in range(4)]
     result = robustness_of(trials, [True, True, True, True, False, True, True, False, False])
-    assert result.shares["velocity_noise"] == 0.5
-    assert result.shares["delay"] == 1.0
+    assert result["velocity_noise"] == 0.5
+    assert result["delay"] == 1.0
 
 
 def test_another_plant_is_not_in_the_benchmark() -> None:

@@ -31,7 +31,6 @@ __all__ = [
     "DURATION",
     "KINDS",
     "Disturbances",
-    "Robustness",
     "Trajectory",
     "Trial",
     "knock_downs",
@@ -132,13 +131,6 @@ class Trial:
     level: str
     disturbances: Disturbances
     seed: int
-
-
-class Robustness(NamedTuple):
-    """Shares of successes by kind, and their mean."""
-
-    shares: dict[str, float]
-    score: float
 
 
 Stepper = Callable[[Vector, Vector, Vector, Vector, Vector], tuple[Vector, Vector]]
@@ -289,8 +281,8 @@ def try_once(plant: PlantParameters, stepper: Stepper, controller: Controller, t
     return bool(np.all(distance < np.array(TOLERANCE)))
 
 
-def robustness_of(trials: Sequence[Trial], successes: Sequence[bool]) -> Robustness:
-    """Return the shares: of runs, and of levels at which more than half of the runs succeed where they are noisy."""
+def robustness_of(trials: Sequence[Trial], successes: Sequence[bool]) -> dict[str, float]:
+    """Return the shares of successes by kind: of runs, or where they are noisy of levels that more than half hold."""
     shares = {}
     for kind in KINDS:
         levels: dict[str, list[bool]] = {}
@@ -299,7 +291,7 @@ def robustness_of(trials: Sequence[Trial], successes: Sequence[bool]) -> Robustn
                 levels.setdefault(trial.level, []).append(success)
         held = [float(np.mean(runs)) > 0.5 for runs in levels.values()]
         shares[kind] = float(np.mean(held)) if held else math.nan
-    return Robustness(shares, float(np.mean(list(shares.values()))))
+    return shares
 
 
 def knock_downs(

@@ -33,15 +33,19 @@ Job = tuple[str, str, int]
 
 @dataclass(frozen=True)
 class Row:
-    """Results of a controller: scores v2 and v3 (one for each seed), and overall robustness v2 or None if untested."""
+    """Results of a controller: scores v2 and v3 (one for each seed), and the shares of its tests of robustness."""
 
     controller: str
     score: float
     criteria: dict[str, float]
-    robustness: float | None
     shares: dict[str, float]
     uptimes: tuple[float, ...]
     run: Trajectory
+
+    @property
+    def robustness(self) -> float | None:
+        """Overall robustness v2; None if it was not tested."""
+        return float(np.mean(list(self.shares.values()))) if self.shares else None
 
     @property
     def uptime_text(self) -> str:
@@ -98,8 +102,8 @@ def score_rows(names: Sequence[str], jobs: Sequence[Job], results: Sequence[Any]
         mine = [(kind, result) for (kind, owner, _), result in zip(jobs, results, strict=True) if owner == name]
         run, criteria, score = next(result for kind, result in mine if kind == "swing_up")
         uptimes = tuple(result for kind, result in mine if kind == "uptime")
-        held = robustness_of(trials, [result for kind, result in mine if kind == "trial"]) if trials else None
-        rows.append(Row(name, score, criteria, held.score if held else None, held.shares if held else {}, uptimes, run))
+        shares = robustness_of(trials, [result for kind, result in mine if kind == "trial"]) if trials else {}
+        rows.append(Row(name, score, criteria, shares, uptimes, run))
     return rows
 
 
