@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, NamedTuple
 from xml.etree import ElementTree
+from xml.etree.ElementTree import SubElement
 
 import typer
 
@@ -28,7 +29,6 @@ from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mecha
 from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import out_option
 from pendulum_sim.exports.ros2_control_tags import add_ros2_control
-from pendulum_sim.exports.xml_files import add, document_text, lateness, number, safe_name
 
 __all__ = ["main", "mjcf", "urdf"]
 
@@ -67,41 +67,41 @@ def urdf(parameters: PlantParameters, *, ros2_control: str = "none", namespace: 
         raise ParameterError(
             f"ros2_control is {ros2_control!r} for {parameters.name!r}; expected a plant of one joint with it"
         )
-    robot = ElementTree.Element("robot", name=safe_name(parameters.name))
+    robot = ElementTree.Element("robot", name=_safe_name(parameters.name))
     parent = "base_link"
-    base = add(robot, "link", name=parent)
+    base = SubElement(robot, "link", name=parent)
     if len(parameters.joints) == 1:
         _urdf_visual(base, "box", (0.0, 0.06, 0.0), _CASING, size="0.06 0.1 0.06")
     limit = 0.0
     for body, joint, own in _parts(parameters):
         at = _at_joint(own, parameters)
-        link = add(robot, "link", name=body.name)
-        inertial = add(link, "inertial")
-        add(inertial, "origin", xyz=_vector(body.centre), rpy="0 0 0")
-        add(inertial, "mass", value=number(body.mass))
+        link = SubElement(robot, "link", name=body.name)
+        inertial = SubElement(link, "inertial")
+        SubElement(inertial, "origin", xyz=_vector(body.centre), rpy="0 0 0")
+        SubElement(inertial, "mass", value=_number(body.mass))
         ixx, iyy, izz = body.inertia
-        moments = {"ixx": number(ixx + at.rotor), "iyy": number(iyy + at.rotor), "izz": number(izz)}
-        add(inertial, "inertia", {**moments, "ixy": "0", "ixz": "0", "iyz": "0"})
+        moments = {"ixx": _number(ixx + at.rotor), "iyy": _number(iyy + at.rotor), "izz": _number(izz)}
+        SubElement(inertial, "inertia", {**moments, "ixy": "0", "ixz": "0", "iyz": "0"})
         _urdf_link(link, body, _tip_radius(parameters, body))
         kind = _urdf_type(joint, own)
-        joint_of = add(robot, "joint", name=joint.name, type=kind)
-        add(joint_of, "parent", link=parent)
-        add(joint_of, "child", link=body.name)
+        joint_of = SubElement(robot, "joint", name=joint.name, type=kind)
+        SubElement(joint_of, "parent", link=parent)
+        SubElement(joint_of, "child", link=body.name)
         # The measured angle of a hanging link is angle_offset: the frame is turned back by it.
-        add(joint_of, "origin", xyz=_vector(body.origin), rpy=f"0 {number(own.angle_offset)} 0")
-        add(joint_of, "axis", xyz=_vector(body.axis))
+        SubElement(joint_of, "origin", xyz=_vector(body.origin), rpy=f"0 {_number(own.angle_offset)} 0")
+        SubElement(joint_of, "axis", xyz=_vector(body.axis))
         # topic_based sends commands to this project's plants; other hardware moves the joint itself.
         limit = at.effort
         if ros2_control == "topic_based":
             limit = parameters.effort_limit
-        limits = {"effort": number(limit), "velocity": number(at.velocity)}
+        limits = {"effort": _number(limit), "velocity": _number(at.velocity)}
         if kind != "continuous":
-            limits["lower"], limits["upper"] = number(_stop(own.lower_stop, -1e6)), number(_stop(own.upper_stop, 1e6))
-        add(joint_of, "limit", limits)
-        add(joint_of, "dynamics", damping=number(at.damping), friction=number(at.friction))
+            limits["lower"], limits["upper"] = _number(_stop(own.lower_stop, -1e6)), _number(_stop(own.upper_stop, 1e6))
+        SubElement(joint_of, "limit", limits)
+        SubElement(joint_of, "dynamics", damping=_number(at.damping), friction=_number(at.friction))
         parent = body.name
     add_ros2_control(robot, ros2_control, namespace, limit)
-    return document_text(robot)
+    return _document_text(robot)
 
 
 def _refuse_torques(parameters: PlantParameters, kind: str) -> None:
@@ -134,47 +134,49 @@ def mjcf(parameters: PlantParameters) -> str:
     if not one and (lags := [actuator.time_constant for actuator in parameters.actuators if actuator.time_constant]):
         # MuJoCo's Runge-Kutta integrates a lag too, and is unstable with longer steps.
         timestep /= math.ceil(timestep / (2.0 * min(lags)))
-    model = ElementTree.Element("mujoco", model=safe_name(parameters.name))
-    add(model, "compiler", angle="radian", autolimits="true")
+    model = ElementTree.Element("mujoco", model=_safe_name(parameters.name))
+    SubElement(model, "compiler", angle="radian", autolimits="true")
     integrator = "implicitfast" if one else "RK4"
-    add(model, "option", gravity=f"0 0 {number(-gravity)}", timestep=number(timestep), integrator=integrator)
-    world = add(model, "worldbody")
-    add(world, "light", pos="0 -1 1.5", dir="0 0.5 -1")
+    SubElement(model, "option", gravity=f"0 0 {_number(-gravity)}", timestep=_number(timestep), integrator=integrator)
+    world = SubElement(model, "worldbody")
+    SubElement(world, "light", pos="0 -1 1.5", dir="0 0.5 -1")
     size = sum(math.dist(body.tip, _ORIGIN) for body, _, _ in parts)
-    add(world, "camera", name="side", pos=f"0 {number(-4.0 * size)} 0", xyaxes="1 0 0 0 0 1")
+    SubElement(world, "camera", name="side", pos=f"0 {_number(-4.0 * size)} 0", xyaxes="1 0 0 0 0 1")
     parent = world
     for body, joint, own in parts:
-        parent = add(parent, "body", name=body.name, pos=_vector(body.origin))
+        parent = SubElement(parent, "body", name=body.name, pos=_vector(body.origin))
         attributes = {"type": "hinge" if joint.unit == "rad" else "slide", "axis": _vector(body.axis)}
         if own.lower_stop is not None or own.upper_stop is not None:
-            attributes["range"] = f"{number(_stop(own.lower_stop, -1e6))} {number(_stop(own.upper_stop, 1e6))}"
-        friction = {"damping": number(own.damping), "frictionloss": number(own.coulomb_friction)}
-        add(parent, "joint", attributes, name=joint.name, ref=number(own.angle_offset), **friction)
-        add(parent, "inertial", pos=_vector(body.centre), mass=number(body.mass), diaginertia=_vector(body.inertia))
+            attributes["range"] = f"{_number(_stop(own.lower_stop, -1e6))} {_number(_stop(own.upper_stop, 1e6))}"
+        friction = {"damping": _number(own.damping), "frictionloss": _number(own.coulomb_friction)}
+        SubElement(parent, "joint", attributes, name=joint.name, ref=_number(own.angle_offset), **friction)
+        SubElement(
+            parent, "inertial", pos=_vector(body.centre), mass=_number(body.mass), diaginertia=_vector(body.inertia)
+        )
         unseen = {"contype": "0", "conaffinity": "0"}
         if body.tip == _ORIGIN:
-            add(parent, "geom", unseen, type="box", size="0.08 0.05 0.03", rgba=_CASING)
+            SubElement(parent, "geom", unseen, type="box", size="0.08 0.05 0.03", rgba=_CASING)
         else:
-            ends, radius = f"0 0 0 {_vector(body.tip)}", number(_tip_radius(parameters, body))
-            add(parent, "geom", unseen, type="capsule", fromto=ends, size=number(_ROD_RADIUS), rgba=_ROD)
-            add(parent, "geom", unseen, type="sphere", pos=_vector(body.tip), size=radius, rgba=_BOB)
+            ends, radius = f"0 0 0 {_vector(body.tip)}", _number(_tip_radius(parameters, body))
+            SubElement(parent, "geom", unseen, type="capsule", fromto=ends, size=_number(_ROD_RADIUS), rgba=_ROD)
+            SubElement(parent, "geom", unseen, type="sphere", pos=_vector(body.tip), size=radius, rgba=_BOB)
     gain = {}
     if drive is not None:
         _add_motor(model, world, drive, parameters)
-        gain = {"gainprm": number(torque_gain(parameters))}
+        gain = {"gainprm": _number(torque_gain(parameters))}
     _add_rotors(model, parameters)
-    actuators = add(model, "actuator")
+    actuators = SubElement(model, "actuator")
     for index, actuator in zip(parameters.coordinates.driven, parameters.actuators, strict=True):
-        late = lateness(actuator.time_constant, actuator.transport_delay, timestep)
-        limit, joint_name = number(actuator.command_limit), parameters.coordinates.names[index]
+        late = _lateness(actuator.time_constant, actuator.transport_delay, timestep)
+        limit, joint_name = _number(actuator.command_limit), parameters.coordinates.names[index]
         names = {"name": "effort" if one else joint_name, "joint": "motor_joint" if drive is not None else joint_name}
         bias = {"biastype": "none"}
         if (motor := actuator.motor) is not None:
             names["name"] = f"{joint_name}_voltage"
-            gain = {"gainprm": number(motor.gain)}
-            bias = {"biastype": "affine", "biasprm": f"0 0 {number(-motor.damping)}"}
-        add(actuators, "general", {**late, **names, **gain}, ctrlrange=f"-{limit} {limit}", **bias)
-    return document_text(model)
+            gain = {"gainprm": _number(motor.gain)}
+            bias = {"biastype": "affine", "biasprm": f"0 0 {_number(-motor.damping)}"}
+        SubElement(actuators, "general", {**late, **names, **gain}, ctrlrange=f"-{limit} {limit}", **bias)
+    return _document_text(model)
 
 
 def _parts(parameters: PlantParameters) -> list[tuple[Body, Joint, JointParameters]]:
@@ -211,27 +213,29 @@ def _tip_radius(parameters: PlantParameters, body: Body) -> float:
 def _add_motor(
     model: ElementTree.Element, world: ElementTree.Element, drive: SeriesElasticParameters, parameters: PlantParameters
 ) -> None:
-    motor = add(world, "body", name="motor")
-    damping, friction = number(total_damping(parameters) - parameters.damping), number(drive.motor_coulomb_friction)
-    hinge = {"type": "hinge", "axis": "0 -1 0", "armature": number(drive.reflected_inertia)}
-    add(motor, "joint", hinge, name="motor_joint", damping=damping, frictionloss=friction)
-    add(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
-    rest = number(-parameters.angle_offset)
-    spring = add(add(model, "tendon"), "fixed", name="spring", stiffness=number(drive.stiffness), springlength=rest)
-    add(spring, "joint", joint="motor_joint", coef="1")
-    add(spring, "joint", joint=JOINT, coef="-1")
+    motor = SubElement(world, "body", name="motor")
+    damping, friction = _number(total_damping(parameters) - parameters.damping), _number(drive.motor_coulomb_friction)
+    hinge = {"type": "hinge", "axis": "0 -1 0", "armature": _number(drive.reflected_inertia)}
+    SubElement(motor, "joint", hinge, name="motor_joint", damping=damping, frictionloss=friction)
+    SubElement(motor, "inertial", pos="0 0 0", mass="1e-6", diaginertia="1e-9 1e-9 1e-9")
+    rest = _number(-parameters.angle_offset)
+    spring = SubElement(
+        SubElement(model, "tendon"), "fixed", name="spring", stiffness=_number(drive.stiffness), springlength=rest
+    )
+    SubElement(spring, "joint", joint="motor_joint", coef="1")
+    SubElement(spring, "joint", joint=JOINT, coef="-1")
 
 
 def _add_rotors(model: ElementTree.Element, parameters: PlantParameters) -> None:
     rotors = [rotor for rotor in parameters.mechanism.rotors(parameters.packed) if rotor.inertia > 0.0]
     if not rotors:
         return
-    tendons = add(model, "tendon")
+    tendons = SubElement(model, "tendon")
     for count, rotor in enumerate(rotors, 1):
-        tendon = add(tendons, "fixed", name=f"rotor_{count}", armature=number(rotor.inertia))
+        tendon = SubElement(tendons, "fixed", name=f"rotor_{count}", armature=_number(rotor.inertia))
         for joint, rate in zip(parameters.mechanism.joints, rotor.rates, strict=True):
             if rate != 0.0:
-                add(tendon, "joint", joint=joint.name, coef=number(rate))
+                SubElement(tendon, "joint", joint=joint.name, coef=_number(rate))
 
 
 def _urdf_type(joint: Joint, own: JointParameters) -> str:
@@ -248,17 +252,17 @@ def _urdf_link(link: ElementTree.Element, body: Body, radius: float) -> None:
     # A cylinder lies along z.
     turned = "0 1.5707963267948966 0" if body.tip[0] else "0 0 0"
     middle = [0.5 * value for value in body.tip]
-    _urdf_visual(link, "cylinder", middle, _ROD, turned, radius=number(_ROD_RADIUS), length=number(length))
-    _urdf_visual(link, "sphere", body.tip, _BOB, radius=number(radius))
+    _urdf_visual(link, "cylinder", middle, _ROD, turned, radius=_number(_ROD_RADIUS), length=_number(length))
+    _urdf_visual(link, "sphere", body.tip, _BOB, radius=_number(radius))
 
 
 def _urdf_visual(
     link: ElementTree.Element, shape: str, xyz: Sequence[float], rgba: str, rpy: str = "0 0 0", **sizes: str
 ) -> None:
-    visual = add(link, "visual")
-    add(visual, "origin", xyz=_vector(xyz), rpy=rpy)
-    add(add(visual, "geometry"), shape, sizes)
-    add(add(visual, "material", name=f"{shape}_colour"), "color", rgba=rgba)
+    visual = SubElement(link, "visual")
+    SubElement(visual, "origin", xyz=_vector(xyz), rpy=rpy)
+    SubElement(SubElement(visual, "geometry"), shape, sizes)
+    SubElement(SubElement(visual, "material", name=f"{shape}_colour"), "color", rgba=rgba)
 
 
 def _stop(value: float | None, otherwise: float) -> float:
@@ -266,7 +270,7 @@ def _stop(value: float | None, otherwise: float) -> float:
 
 
 def _vector(values: Sequence[float]) -> str:
-    return " ".join(number(value) for value in values)
+    return " ".join(_number(value) for value in values)
 
 
 def export(
@@ -294,6 +298,30 @@ def export(
         return
     with writing(f"model file {output}", ParameterError):
         write_atomically(output, text)
+
+
+def _number(value: float) -> str:
+    """Return a number as text with all digits."""
+    return repr(float(value))
+
+
+def _lateness(lag: float, delay: float, timestep: float) -> dict[str, str]:
+    """Return a MuJoCo actuator's attributes for lag and transport delay [s]; a delay needs MuJoCo 4 or later."""
+    attributes = {"dyntype": "filterexact", "dynprm": _number(lag)} if lag > 0.0 else {}
+    if delay > 0.0:
+        attributes |= {"delay": _number(delay), "nsample": str(math.ceil(delay / timestep - 1e-9) + 1)}
+    return attributes
+
+
+def _safe_name(name: str) -> str:
+    """Return a name of letters, digits, ``_`` and ``-``."""
+    return "".join(c if c.isalnum() or c in "_-" else "_" for c in name) or "pendulum"
+
+
+def _document_text(root: ElementTree.Element) -> str:
+    """Return the document, indented."""
+    ElementTree.indent(root)
+    return '<?xml version="1.0"?>\n' + ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 main = command_line(export, "python -m pendulum_sim export_model")

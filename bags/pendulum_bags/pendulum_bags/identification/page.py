@@ -19,12 +19,22 @@ from pendulum_bags.identification.problem import simulate
 from pendulum_bags.identification.result import ALARMS, IdentificationResult, PendulumResult
 from pendulum_bags.identification.thesis import ThesisResult, trial_part
 from pendulum_bags.identification.thesis_figures import TrialSet, thesis_figures
-from pendulum_bags.pages.sheet import Sentence, write_sheet
+from pendulum_bags.pages.html import encoded, render_plain
 from pendulum_bags.runs.datasets import Recording, distinct_names
+from pendulum_msgs_py.atomic_write import write_atomically, writing
+from pendulum_msgs_py.errors import DataError
 
 __all__ = ["write_page", "write_thesis_page"]
 
 _MEASURED, _SIMULATED = "#444444", "#c2410c"
+
+
+@dataclass(frozen=True)
+class _Sentence:
+    """A sentence at the top of a page, highlighted if ``alarming``."""
+
+    text: str
+    alarming: bool = False
 
 
 def write_page(result: IdentificationResult, folder: str | Path) -> Path:
@@ -34,7 +44,7 @@ def write_page(result: IdentificationResult, folder: str | Path) -> Path:
     names = result.uncertainty.names
     rows = zip(names, result.uncertainty.correlation, strict=True)
     correlation = [(name, *(f"{value:+.2f}" for value in row)) for name, row in rows]
-    return write_sheet(
+    return _write_sheet(
         target / "index.html",
         "Identification",
         _marked([result.verdict, *result.sentences()]),
@@ -54,7 +64,7 @@ def write_thesis_page(result: ThesisResult, recordings: Sequence[Recording], fol
         (name, f"{value:.5g}", f"{result.intervals[name][0]:.5g} to {result.intervals[name][1]:.5g}", UNITS[name])
         for name, value in result.average.items()
     ]
-    return write_sheet(
+    return _write_sheet(
         target / "index.html",
         f"Regression: {result.kind.replace('_', ' and ')}",
         _marked(result.sentences),
@@ -65,8 +75,8 @@ def write_thesis_page(result: ThesisResult, recordings: Sequence[Recording], fol
     )
 
 
-def _marked(sentences: Sequence[str]) -> list[Sentence]:
-    return [Sentence(sentence, alarming=sentence.startswith(ALARMS)) for sentence in sentences]
+def _marked(sentences: Sequence[str]) -> list[_Sentence]:
+    return [_Sentence(sentence, alarming=sentence.startswith(ALARMS)) for sentence in sentences]
 
 
 @dataclass(frozen=True)
@@ -168,3 +178,35 @@ def _save(figures: Mapping[str, Canvas], folder: Path) -> list[Path]:
         figure.savefig(path, dpi=120)
         paths.append(path)
     return paths
+
+
+def _write_sheet(
+    path: Path,
+    title: str,
+    sentences: Sequence[_Sentence],
+    tables: Sequence[Table],
+    pictures: Sequence[Path],
+    *,
+    kicker: str = "",
+    listings: Sequence[tuple[str, str]] = (),
+    notes: Sequence[str] = (),
+) -> Path:
+    """Write a page and return its path; a DataError if it cannot be written.
+
+    The first sentence is above everything, the first PNG picture under it. Tables with rows are between the first
+    picture and the others. ``kicker`` is a line above the heading; ``listings`` are heading and text of another
+    program's output; ``notes`` are sentences before the pictures.
+    """
+    text = render_plain(
+        "sheet.html.j2",
+        title=title,
+        kicker=kicker,
+        sentences=sentences,
+        tables=[table for table in tables if table.rows],
+        listings=listings,
+        notes=notes,
+        pictures=[(one.stem.replace("_", " "), encoded(one.read_bytes())) for one in pictures],
+    )
+    with writing(f"page {path}", DataError):
+        write_atomically(path, text)
+    return path
