@@ -61,6 +61,8 @@ def study_text(study: Study) -> list[str]:
     ]
     for criterion in SIMULATED:
         ranked = [one.ranking for one in found if one.ranking is not None and one.criterion == criterion]
+        if not ranked:
+            continue
         wrong = [pair for one in ranked for pair in one.wrong]
         text.append(
             f"By {criterion} the simulation's pick is the best on the machine in "
