@@ -42,6 +42,7 @@ _WAITS = (
     "tests/acceptance/test_console.py",
     "tests/integration/test_plant_interface.py",
     "tests/acceptance/test_first_day.py",
+    "tests/acceptance/test_small_drives.py",
     "tests/integration/test_programs_end_with_their_starter.py",
     "pendulum_lqr/test/test_lqr_nodes.py",
     "pendulum_lqr/test/test_running_plant.py",

@@ -3,17 +3,20 @@
 import math
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from pendulum_hw_bridge.backends import emulator_process
 from pendulum_hw_bridge.backends import hebi as hebi_backend
+from pendulum_hw_bridge.backends.dynamixel import DynamixelBackend
 from pendulum_hw_bridge.backends.emulator import EmulatorBackend
 from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 from pendulum_hw_bridge.backends.hebi import HebiBackend
 from pendulum_hw_bridge.backends.hebi_emulated import EmulatedGroup
 from pendulum_hw_bridge.backends.replay import FeedbackRecording, ReplayBackend
+from pendulum_hw_bridge.backends.torque_drive import TORQUE_LOOP, TorqueDrive
 from pendulum_hw_bridge.emulation.parameters import load_emulator
 from pendulum_hw_bridge.emulation.server import EmulatorServer
 from pendulum_hw_bridge.emulation.x5 import EmulatedX5
@@ -23,6 +26,7 @@ from pendulum_hw_bridge.port.actuator import (
     Command,
     Feedback,
     HardwareLimits,
+    MStopAction,
     Strategy,
 )
 from pendulum_hw_bridge.port.clocks import SteppedClock
@@ -30,6 +34,7 @@ from pendulum_hw_bridge.port.command_check import check_command
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, differing_gain
 from pendulum_msgs_py.contract.timing import SteadyWallClock
 from pendulum_msgs_py.errors import ParameterError
+from pendulum_testing.drive_rigs import SteppedServo
 
 
 def emulator() -> EmulatorBackend:
@@ -47,12 +52,17 @@ def hebi_imitation() -> HebiBackend:
     return HebiBackend(make_group=lambda: hebi.util.create_imitation_group(1), imitation=True)
 
 
+def dynamixel() -> DynamixelBackend:
+    pytest.importorskip("dynamixel_sdk", reason="dynamixel-sdk is not installed")
+    return SteppedServo(model="XM430-W350").port
+
+
 def hebi_on(where: str) -> HebiBackend:
     hebi = pytest.importorskip("hebi", reason="hebi-py is not installed")
     return HebiBackend(make_group=lambda: EmulatedGroup(where, hebi))
 
 
-@pytest.fixture(params=["emulator", "emulator_process", "replay", "hebi", "hebi_emulated"])
+@pytest.fixture(params=["emulator", "emulator_process", "replay", "hebi", "hebi_emulated", "dynamixel"])
 def port(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[ActuatorPort]:
     # The emulator's thread may have to wait for a core; how long a stop waits is no part of the contract.
     monkeypatch.setattr(emulator_process, "_STOP_PATIENCE", 5.0)
@@ -63,6 +73,7 @@ def port(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
             "emulator": emulator,
             "replay": replay,
             "hebi": hebi_imitation,
+            "dynamixel": dynamixel,
         }
         backend = makers[request.param]()
         yield backend
@@ -77,7 +88,7 @@ def port(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Ite
     thread.start()
     host, number = server.address
     make = EmulatorProcessBackend if request.param == "emulator_process" else hebi_on
-    process_backend: ActuatorPort = make(f"{host}:{number}")  # type: ignore[operator]
+    process_backend: ActuatorPort = make(f"{host}:{number}")
     yield process_backend
     process_backend.close()
     running.clear()
@@ -117,13 +128,14 @@ def test_connecting_twice_changes_nothing(port: ActuatorPort) -> None:
 
 def test_settings_read_back(port: ActuatorPort) -> None:
     port.connect()
-    assert port.set_command_lifetime(0.05) == pytest.approx(0.05)
+    assert port.set_command_lifetime(0.06) == pytest.approx(0.06)
     assert port.set_feedback_rate(100.0) == pytest.approx(100.0)
     # hebi-py keeps single precision: what has few bits comes back as it went.
     limits = HardwareLimits(effort=5.0, velocity=1.25, position_min=-4.0, position_max=4.0)
-    assert port.set_limits(limits) == limits
+    without_stop = replace(limits, m_stop=MStopAction.DISABLED)
+    assert port.set_limits(limits) == (without_stop if isinstance(port, TorqueDrive) else limits)
     assert not differing_gain(port.set_gains(DEFAULT_GAINS[3]), DEFAULT_GAINS[3])
-    for strategy in Strategy:
+    for strategy in (TORQUE_LOOP, Strategy.OFF) if isinstance(port, TorqueDrive) else Strategy:
         assert port.set_strategy(strategy) is strategy
         assert port.strategy is strategy
 
@@ -148,6 +160,13 @@ def test_feedback_is_complete_new_and_stamped_with_the_ports_clock(port: Actuato
 def test_write_returns_what_was_really_applied(port: ActuatorPort) -> None:
     port.connect()
     port.set_limits(HardwareLimits(effort=5.0, velocity=1.2, pwm=0.3))
+    if isinstance(port, TorqueDrive):
+        port.set_strategy(TORQUE_LOOP)
+        applied = port.write(Command(effort=-7.0))
+        assert applied.limited
+        assert applied.command.effort == pytest.approx(-5.0, abs=0.005)
+        assert applied.command.effort >= -5.0
+        return
     port.set_strategy(Strategy.DIRECT_PWM)
     applied = port.write(Command(pwm=0.9))
     assert applied.command.pwm == 0.3
@@ -160,9 +179,13 @@ def test_write_returns_what_was_really_applied(port: ActuatorPort) -> None:
 
 def test_a_setpoint_that_the_strategy_does_not_know_is_refused(port: ActuatorPort) -> None:
     port.connect()
-    port.set_strategy(Strategy.DIRECT_PWM)
-    with pytest.raises(ParameterError, match="under DIRECT_PWM"):
-        port.write(Command(effort=1.0))
+    if isinstance(port, TorqueDrive):
+        with pytest.raises(ActuatorError, match="strategy is DIRECT_PWM; expected OFF or PARALLEL_PWM"):
+            port.set_strategy(Strategy.DIRECT_PWM)
+    else:
+        port.set_strategy(Strategy.DIRECT_PWM)
+        with pytest.raises(ParameterError, match="under DIRECT_PWM"):
+            port.write(Command(effort=1.0))
     port.set_strategy(Strategy.PARALLEL_PWM)
     with pytest.raises(ParameterError, match="pwm setpoint under strategy PARALLEL_PWM"):
         port.write(Command(pwm=0.1))
@@ -179,8 +202,12 @@ def test_an_infinite_setpoint_is_refused_before_it_is_sent(port: ActuatorPort, v
 def test_stop_ends_with_strategy_off_and_may_be_called_at_any_time(port: ActuatorPort) -> None:
     port.stop()
     port.connect()
-    port.set_strategy(Strategy.DIRECT_PWM)
-    port.write(Command(pwm=0.1))
+    if isinstance(port, TorqueDrive):
+        port.set_strategy(TORQUE_LOOP)
+        port.write(Command(effort=0.1))
+    else:
+        port.set_strategy(Strategy.DIRECT_PWM)
+        port.write(Command(pwm=0.1))
     port.stop()
     assert port.strategy is Strategy.OFF
     port.stop()

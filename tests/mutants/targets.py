@@ -122,6 +122,18 @@ TARGETS: tuple[Target, ...] = (
         ("pendulum_msgs_py/test/test_commander_watch.py",),
     ),
     Target(
+        "pendulum_hw_bridge.backends.torque_drive",
+        ("TorqueDrive",),
+        (f"{_BRIDGE}/test_dynamixel.py", f"{_BRIDGE}/test_actuator_contract.py"),
+        choose="dynamixel and not real_terminal",
+    ),
+    Target(
+        "pendulum_hw_bridge.backends.dynamixel",
+        ("DynamixelBackend",),
+        (f"{_BRIDGE}/test_dynamixel.py",),
+        choose="not real_terminal",
+    ),
+    Target(
         "pendulum_hw_bridge.backends.hebi",
         ("HebiBackend", "_known", "connect_group"),
         (f"{_BRIDGE}/test_hebi_backend.py", f"{_BRIDGE}/test_hebi_rules.py"),
@@ -140,7 +152,7 @@ TARGETS: tuple[Target, ...] = (
     ),
     Target(
         "pendulum_hw_bridge.bridge.group_assembly",
-        ("GroupAssembly", "refuse_slides", "_of_joint"),
+        ("GroupAssembly", "refuse_slides", "values_of_joint"),
         (f"{_BRIDGE}/test_group_assembly.py",),
     ),
     Target("pendulum_hw_bridge.bridge.bridge", ("Bridge",), (*_CYCLE, f"{_BRIDGE}/test_hebi_group.py")),

@@ -6,13 +6,31 @@ import importlib
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from pendulum_msgs_py.parameters import ParameterSpec
+from pendulum_msgs_py.parameters import ParameterSpec, ParameterValue
 
 if TYPE_CHECKING:
+    from pendulum_hw_bridge.backends.torque_drive import DriveModel, Identity
     from pendulum_hw_bridge.port.actuator import ActuatorPort
     from pendulum_hw_bridge.port.clocks import Clock
 
-__all__ = ["BACKENDS", "Backend"]
+__all__ = ["BACKENDS", "Backend", "Bounds"]
+
+
+class Bounds(NamedTuple):
+    """Largest limits that protect a machine; ``actuator`` names it in messages.
+
+    Attributes:
+        effort: Peak torque [N m].
+        velocity: Twice what the motor can do, so that a larger limit limits nothing [rad/s].
+        supply: Widest window of the supply [V].
+        m_stop: Whether the actuator has an input for a motion stop.
+    """
+
+    effort: float = 13.0
+    velocity: float = 3.0
+    supply: tuple[float, float] = (18.0, 52.0)
+    actuator: str = "an X5-9"
+    m_stop: bool = True
 
 
 class Backend(NamedTuple):
@@ -24,12 +42,18 @@ class Backend(NamedTuple):
         parameters: Bridge parameters that only this backend reads.
         is_machine: Whether a real machine moves: the bridge's own limits are then the strict ones.
         in_process: Whether it runs in this process: then parameters describe it and it supports simulated time.
+        bounds: Largest limits that the bridge accepts on a machine.
+        defaults: Defaults of the bridge's parameters that differ with this backend.
+        torque_drive: Whether its drives have a current loop: then the class is a ``TorqueDrive``.
     """
 
     target: str
     parameters: tuple[ParameterSpec, ...] = ()
     is_machine: bool = True
     in_process: bool = False
+    bounds: Bounds = Bounds()
+    defaults: Mapping[str, ParameterValue] = {}
+    torque_drive: bool = False
 
     def make(self, values: Mapping[str, Any], clock: Clock, *, lockstep: bool = False) -> ActuatorPort:
         """Return the port that the parameters describe, not connected yet.
@@ -39,11 +63,22 @@ class Backend(NamedTuple):
         Raises:
             ParameterError: A parameter of the backend is refused.
         """
-        module, name = self.target.split(":")
-        port: ActuatorPort = getattr(importlib.import_module(module), name).from_parameters(
-            values, clock, lockstep=lockstep
-        )
+        port: ActuatorPort = self._type().from_parameters(values, clock, lockstep=lockstep)
         return port
+
+    def drive_of(self, model: str) -> DriveModel:
+        """Return a model of the backend's drives by its name; ParameterError if it is unknown."""
+        drive: DriveModel = self._type().drive_of(model)
+        return drive
+
+    def scan(self, values: Mapping[str, Any]) -> list[Identity]:
+        """Return the drives that answer on a bus; ActuatorError if it cannot be opened."""
+        found: list[Identity] = self._type().scan(values)
+        return found
+
+    def _type(self) -> Any:
+        module, name = self.target.split(":")
+        return getattr(importlib.import_module(module), name)
 
 
 def _fixed(name: str, default: str, description: str) -> tuple[ParameterSpec, ...]:
@@ -70,10 +105,28 @@ _OF_GROUPS = (
     _of_joints("joint_offsets", [0.0], "rad", "joint angle at which each module reads zero"),
     _of_joints("joint_signs", [1.0], "-", "1, or -1 where a module turns the other way"),
     _of_joints("effort_tares", [0.0], "N m", "torque that each sensor shows when nothing pulls"),
+    ParameterSpec("drive_ids", [1.0], "", "`dynamixel` with several joints: number of each drive.", read_only=True),
 )
 """Parameters of several modules; for a single module the same names in the singular."""
 
 BACKENDS: dict[str, Backend] = {
+    "dynamixel": Backend(
+        "pendulum_hw_bridge.backends.dynamixel:DynamixelBackend",
+        bounds=Bounds(4.5, 15.0, (3.5, 16.0), "an XM430-W350", m_stop=False),
+        defaults={
+            "plant": "xl330",
+            "drive_model": "XL330-M288",
+            "bus_rate": 1_000_000,
+            "command_lifetime": 0.04,
+            "velocity_limit": 8.0,
+            "start_effort_limit": 0.1,
+            "handover_effort_limit": 0.1,
+            "voltage_window": [3.8, 6.2],
+            "winding_temperature_limit": 70.0,
+            "derating_temperature": 60.0,
+        },
+        torque_drive=True,
+    ),
     "emulator": Backend("pendulum_hw_bridge.backends.emulator:EmulatorBackend", is_machine=False, in_process=True),
     "emulator_process": Backend(
         "pendulum_hw_bridge.backends.emulator_process:EmulatorProcessBackend",

@@ -11,6 +11,7 @@ from pendulum_hw_bridge.backends import BACKENDS
 from pendulum_hw_bridge.backends.emulated_machine import TORQUE_LOOP, DrivePort, machine_ports
 from pendulum_hw_bridge.bridge import bridge_parameters
 from pendulum_hw_bridge.bridge.bridge_consistency import check_consistency
+from pendulum_hw_bridge.bridge.drive_assembly import DriveAssembly
 from pendulum_hw_bridge.bridge.group_assembly import OF_GROUPS, GroupAssembly, refuse_slides
 from pendulum_hw_bridge.bridge.module import DrivenModule, Module
 from pendulum_hw_bridge.drive.current_drive import CurrentCheck, CurrentMapping, VoltageMapping
@@ -32,6 +33,7 @@ from pendulum_msgs_py.parameters import ParameterSpec
 from pendulum_msgs_py.plants.joint_parameters import Actuator
 from pendulum_msgs_py.plants.plant_parameters import (
     MECHANISM_PRESETS,
+    PRESETS,
     PlantParameters,
     common_delay,
     is_mechanism,
@@ -94,6 +96,9 @@ class Assembly:
 
 def for_plant(specs: tuple[ParameterSpec, ...], plant: str, backend: str = "emulator") -> tuple[ParameterSpec, ...]:
     """Return the bridge's parameters with defaults for several joints; ParameterError if there is no such plant."""
+    if backend in BACKENDS:
+        own = BACKENDS[backend].defaults
+        specs = tuple(replace(spec, default=own.get(spec.name, spec.default)) for spec in specs)
     if not is_mechanism(plant):
         return specs
     mechanism = load_mechanism(plant)
@@ -116,6 +121,8 @@ def assemble(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
     Raises:
         ParameterError: The parameters contradict each other or the plant.
     """
+    if BACKENDS[values["backend"]].torque_drive:
+        return _drives(values, lockstep=lockstep)
     if is_mechanism(values["plant"]):
         return _several(values, specs, lockstep=lockstep)
     if values["initial_positions"] != [0.0]:
@@ -250,6 +257,21 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
 
     strategy = AMPLIFIER if coordinates.volts else CURRENT_LOOP
     return Assembly(coordinates, limits, [plant], f"emulated machine {plant.name}", strategy, mappings[0], modules)
+
+
+def _drives(values: Mapping[str, Any], *, lockstep: bool) -> Assembly:
+    plant = load_mechanism(values["plant"])
+    bridge_parameters.require_real_time(values, lockstep=lockstep)
+    limits = bridge_parameters.supervisor_limits(
+        values, plant.command_limits, push=plant.effort_limits, coordinates=plant.coordinates, lockstep=lockstep
+    )
+    check_consistency(values, limits)
+    made = DriveAssembly(values, plant, limits)
+    known = values["plant"] in PRESETS or values["plant"] in MECHANISM_PRESETS
+    name = f"{values['drive_model']}, {values['backend']}"
+    # A preset is not a measurement of this machine.
+    described = [] if known else [plant]
+    return Assembly(plant.coordinates, limits, described, name, CURRENT_LOOP, made.mappings[0], made.modules)
 
 
 def _mapping(

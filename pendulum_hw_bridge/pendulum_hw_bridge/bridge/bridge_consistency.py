@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from pendulum_hw_bridge.backends import BACKENDS
+from pendulum_hw_bridge.backends import BACKENDS, Bounds
 from pendulum_hw_bridge.drive.effort_mapping import EffortStrategy
-from pendulum_hw_bridge.port.actuator import PEAK_EFFORT, MStopAction
+from pendulum_hw_bridge.port.actuator import MStopAction
 from pendulum_msgs_py.contract.drive import PlantLimits
 from pendulum_msgs_py.errors import ParameterError
 
@@ -20,10 +20,8 @@ _SLOWEST = 1.0
 """Longest detection time of any fault, on an emulator on a busy machine [s]."""
 _SLOWEST_ON_HARDWARE = 0.1
 """The same where people can be hurt [s]."""
-_SUPPLY = (18.0, 52.0)
-"""Widest supply window [V]: an X5-9 takes 24 to 48 V, batteries sag below, braking motors lift it above."""
-_LARGEST_MEASURED = PEAK_EFFORT + 2.0
-"""Largest limit of the measured torque [N m]: peak of an X5-9, with margin for noise and a tare."""
+_MEASURED_MARGIN = 2.0
+"""Largest limit of the measured torque, above the peak of the actuator: noise and a tare [N m]."""
 _E_STOP_INPUT = (0.05, 1.0)
 """Silence that counts as a press [s]: at 20 Hz, below this range one late message is one; above, a cut cable is noticed
 late.
@@ -68,16 +66,22 @@ def check_consistency(values: Mapping[str, Any], limits: PlantLimits) -> None:
             "its torque loop, woken by a stop, makes more torque than acted"
         )
     if hardware:
-        _check_hardware(values, limits)
+        _check_hardware(values, limits, BACKENDS[values["backend"]].bounds)
 
 
-def _check_hardware(values: Mapping[str, Any], limits: PlantLimits) -> None:
-    """Refuse limits too large to protect an X5-9; too small ones only stop it early, which is safe."""
+def _check_hardware(values: Mapping[str, Any], limits: PlantLimits, bounds: Bounds) -> None:
+    """Refuse limits too large to protect the machine; too small ones only stop it early, which is safe."""
     where = f"with backend {values['backend']!r}"
     width = max(high - low for low, high in zip(limits.position_min, limits.position_max, strict=True))
     for name, value, largest, unit, why in (
-        ("effort_limit", max(limits.effort), PEAK_EFFORT, "N m", "the peak of an X5-9"),
-        ("velocity_limit", limits.velocity, 3.0, "rad/s", "twice what the motor can do, so that it limits nothing"),
+        ("effort_limit", max(limits.effort), bounds.effort, "N m", f"the peak of {bounds.actuator}"),
+        (
+            "velocity_limit",
+            limits.velocity,
+            bounds.velocity,
+            "rad/s",
+            "twice what the motor can do, so that it limits nothing",
+        ),
         ("effort_slew_limit", limits.slew, 26e3, "N m/s", "from -13 to 13 N m in one cycle at 1 kHz"),
         ("start_effort_limit", limits.start_effort, 5.0, "N m", "a commander would begin with a blow"),
         ("starvation_limit", limits.starvation, 120.0, "s", "an armed plant would be forgotten"),
@@ -90,21 +94,21 @@ def _check_hardware(values: Mapping[str, Any], limits: PlantLimits) -> None:
             raise ParameterError(f"{name} is none; expected one {where}")
         if value > largest:
             raise ParameterError(f"{name} is {value:g} {unit}; expected at most {largest:g} {unit} {where}: {why}")
-    if values["measured_effort_limit"] > _LARGEST_MEASURED:
+    if values["measured_effort_limit"] > bounds.effort + _MEASURED_MARGIN:
         raise ParameterError(
             f"measured_effort_limit is {values['measured_effort_limit']:g} N m; expected at most "
-            f"{_LARGEST_MEASURED:g} N m {where}: the actuator makes {PEAK_EFFORT:g} N m"
+            f"{bounds.effort + _MEASURED_MARGIN:g} N m {where}: the actuator makes {bounds.effort:g} N m"
         )
-    if values["m_stop_action"] == MStopAction.DISABLED.value:
+    if bounds.m_stop and values["m_stop_action"] == MStopAction.DISABLED.value:
         raise ParameterError(
             f"m_stop_action is {MStopAction.DISABLED.value}; expected {MStopAction.MOTOR_OFF.value} or "
             f"{MStopAction.HOLD_POSITION.value} {where}: the motion stop would stop nothing"
         )
-    low, high = _SUPPLY
+    low, high = bounds.supply
     if not all(low <= voltage <= high for voltage in values["voltage_window"]):
         raise ParameterError(
             f"voltage_window is {values['voltage_window']} V; expected inside {low:g} to {high:g} V {where}: "
-            "the actuator takes 24 to 48 V"
+            f"the range of {bounds.actuator}"
         )
     low, high = _E_STOP_INPUT
     silence = values["e_stop_input_timeout"]

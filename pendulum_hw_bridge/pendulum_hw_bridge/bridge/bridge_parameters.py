@@ -63,6 +63,10 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
         "Type that the HEBI actuator must be of, since constants and limits are those of an X5-9; empty for any."),
     _fixed("interface", "", "",
         "Network address on which to search the HEBI actuator; empty for all; `emulator:HOST:PORT` in a rehearsal."),
+    _fixed("drive_id", 1, "", "Number of the drive on its bus; with several joints `drive_ids`.", minimum=0,
+        maximum=252),
+    _fixed("drive_model", "", "", "Model of the drive on a bus; it must be the one that answers."),
+    _fixed("bus_rate", 0, "1/s", "Bits per second of the drive's bus.", minimum=0),
     _fixed("feedback_rate", 100.0, "Hz", "Feedback records, and so control cycles, per second.", minimum=1.0,
         maximum=1000.0),
     _fixed("command_lifetime", 0.05, "s",
@@ -115,7 +119,9 @@ BRIDGE_SPECS: tuple[ParameterSpec, ...] = (
 
 
 def plant_of(values: Mapping[str, Any]) -> PlantParameters:
-    """Return the plant file's content; ParameterError if missing or without a drivetrain."""
+    """Return the plant file's content; ParameterError if missing, or without a drivetrain that the actuator needs."""
+    if BACKENDS[values["backend"]].torque_drive:
+        return load_plant(values["plant"])
     from pendulum_hw_bridge.emulation.parameters import load_emulator
 
     return load_emulator(values["plant"]).plant

@@ -19,7 +19,7 @@ from pendulum_msgs_py.contract.joints import Coordinates
 from pendulum_msgs_py.contract.values import NANOSECONDS
 from pendulum_msgs_py.errors import ParameterError
 
-__all__ = ["OF_GROUPS", "GroupAssembly", "refuse_slides"]
+__all__ = ["OF_GROUPS", "GroupAssembly", "refuse_slides", "values_of_joint"]
 
 OF_GROUPS = {
     "families": "family",
@@ -29,6 +29,7 @@ OF_GROUPS = {
     "joint_offsets": "joint_offset",
     "joint_signs": "joint_sign",
     "effort_tares": "effort_tare",
+    "drive_ids": "drive_id",
 }
 """Parameters of several modules -> those of one."""
 
@@ -50,7 +51,7 @@ class GroupAssembly:
         self._values = values
         self._coordinates = coordinates
         self._limits = limits
-        self._joints = [_of_joint(values, coordinates, index) for index in range(len(coordinates.joints))]
+        self._joints = [values_of_joint(values, coordinates, index) for index in range(len(coordinates.joints))]
         self._plant = load_emulator(values["drivetrain"]).plant
         self._gains = bridge_parameters.trajectory_gains(values)
         self.mappings = [self._mapping(driven) for driven in range(len(coordinates.driven))]
@@ -99,7 +100,7 @@ class GroupAssembly:
         )
 
 
-def _of_joint(values: Mapping[str, Any], coordinates: Coordinates, index: int) -> dict[str, Any]:
+def values_of_joint(values: Mapping[str, Any], coordinates: Coordinates, index: int) -> dict[str, Any]:
     """Return the bridge's parameters with those of one joint under their names for a single module."""
     own = dict(values)
     for several, one in OF_GROUPS.items():

@@ -24,12 +24,11 @@ def specs_of(node: Node) -> tuple[ParameterSpec, ...]:
         ParameterError: There is no such plant, or the lab file is refused.
     """
     overrides: Mapping[str, Any] = node._parameter_overrides
-    plant, backend = (
-        str(overrides[name].value) if name in overrides else default
-        for name, default in (("plant", "thesis"), ("backend", "emulator"))
-    )
-    table = for_plant(SPECS, plant, backend)
     lab = overrides.get("lab_file")
+    of_lab = load_lab(str(lab.value)).values if lab is not None and lab.value else {}
+    given = {**of_lab, **{name: overrides[name].value for name in ("plant", "backend") if name in overrides}}
+    backend = str(given.get("backend", "emulator"))
+    table = for_plant(SPECS, str(given.get("plant", "thesis")), backend)
     if lab is None or not lab.value:
         return table
     values = _read(str(lab.value), table)

@@ -25,10 +25,7 @@ from pendulum_hw_bridge.port.actuator import (
 from pendulum_hw_bridge.port.settings import BridgeSettings, write_rate, write_settings
 from pendulum_msgs_py.contract.supervisor import Drive, DriveKind
 
-__all__ = ["TRAJECTORY_STRATEGY", "DrivenModule", "Module"]
-
-TRAJECTORY_STRATEGY = Strategy.PARALLEL_PWM
-"""Strategy under which trajectories are followed (3, as in the thesis)."""
+__all__ = ["DrivenModule", "Module"]
 
 
 class Module:
@@ -204,10 +201,11 @@ class DrivenModule(Module):
         self._dither = -self._dither
         velocity = sign * drive.velocity[index]
         place = sign * (drive.position[index] - self.settings.joint_offset)
-        return TRAJECTORY_STRATEGY, Command(
+        setpoints = Command(
             position=place + drive.handover * offset + self._dither,
             velocity=velocity + drive.handover * (speed - velocity),
         )
+        return mapping.follow(setpoints, feedback)
 
     def _confirm(self, reads: Strategy, wanted: Strategy) -> None:
         if reads is not wanted:

@@ -17,6 +17,7 @@ from pendulum_hw_bridge.checks.checklist import run_checklist
 from pendulum_hw_bridge.checks.machine_checklist import run_machine_checklist
 from pendulum_hw_bridge.checks.nudge import hand_of
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
+from pendulum_hw_bridge.port.actuator import Strategy
 from pendulum_hw_bridge.port.clocks import WallClock
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism, load_mechanism
@@ -111,6 +112,7 @@ def _go_through(
     machine = machine_of(values)
     modules = machine.modules(WallClock())
     windows = list(zip(machine.limits.position_min, machine.limits.position_max, strict=True))
+    backend = BACKENDS[values["backend"]]
     if is_mechanism(values["plant"]):
         return run_machine_checklist(modules, load_mechanism(values["plant"]), windows, progress=progress)
     (module,) = modules
@@ -123,6 +125,8 @@ def _go_through(
         window=windows[0],
         hand=None if ask is None else hand_of(module.port, ask),
         hangs=not values["flat"],
+        strategy=module.mapping.strategy if backend.torque_drive else Strategy.DIRECT_PWM,
+        m_stop=backend.bounds.m_stop,
         progress=progress,
     )
 

@@ -62,4 +62,4 @@ def machine_of(values: Mapping[str, Any]) -> Assembly:
             f"backend is 'hebi' with plant {values['plant']!r}; expected 'emulator': several real modules are not "
             "checked yet"
         )
-    return assemble(values, for_plant(SPECS, values["plant"]))
+    return assemble(values, for_plant(SPECS, values["plant"], values["backend"]))

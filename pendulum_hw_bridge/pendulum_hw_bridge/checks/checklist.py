@@ -69,13 +69,16 @@ def run_checklist(
     window: tuple[float, float] = (-math.inf, math.inf),
     hand: Hand | None = None,
     hangs: bool = True,
+    strategy: Strategy = Strategy.DIRECT_PWM,
+    m_stop: bool = True,
     host: Punctuality | None = None,
     progress: Callable[[str], None] = lambda text: None,
 ) -> Checklist:
     """Run the checklist; the duty is always zero, and the motor is off at the end.
 
     The port is not connected yet. ``window`` has the allowed joint angles [rad]; without ``hand`` the sign stays
-    untried; ``hangs`` is False for a pendulum that lies flat; ``host`` measures this computer's lateness.
+    untried; ``hangs`` is False for a pendulum that lies flat; ``strategy`` is tried without torque;
+    without ``m_stop`` there is no motion stop; ``host`` measures this computer's lateness.
     """
     found = Checklist()
     items = found.items
@@ -87,7 +90,7 @@ def run_checklist(
         mapping = None
         if plant.drivetrain is not None:
             mapping = EffortMapping(EffortStrategy.DIRECT_PWM, plant.drivetrain, effort_limit=settings.limits.effort)
-        items += setting_items(port, settings, mapping)
+        items += setting_items(port, settings, mapping, m_stop=m_stop)
         records = listen(port, settings, limits, host or HostWatch(), found, progress)
         items.append(acknowledgement_item(port, settings, found))
         if records:
@@ -98,7 +101,8 @@ def run_checklist(
                 )
             items += rest_items(records, settings, plant, window, hangs)
         progress("trying the strategy at zero torque")
-        items.append(strategy_item(port, Strategy.DIRECT_PWM, "direct PWM can be set"))
+        name = "direct PWM" if strategy is Strategy.DIRECT_PWM else "loop of torque"
+        items.append(strategy_item(port, strategy, f"{name} can be set"))
         items.append(sign_item(port, settings, hand, progress))
     except PendulumError as error:
         items.append(error_item(error))
@@ -117,8 +121,13 @@ def identity(info: ActuatorInfo) -> str:
     return f"{info.backend} {info.family}/{info.name}{serial}{firmware}"
 
 
-def setting_items(port: ActuatorPort, settings: BridgeSettings, mapping: EffortMapping | None) -> list[CheckItem]:
-    """Write all settings and check that each reads back; with the mapping, report the torque at the limit."""
+def setting_items(
+    port: ActuatorPort, settings: BridgeSettings, mapping: EffortMapping | None, *, m_stop: bool = True
+) -> list[CheckItem]:
+    """Write all settings and check that each reads back; with the mapping, report the torque at the limit.
+
+    Without ``m_stop`` the actuator has no input for a motion stop.
+    """
     lifetime = port.set_command_lifetime(settings.command_lifetime)
     rate = port.set_feedback_rate(settings.feedback_rate)
     limits, joint = port.set_limits(settings.limits), settings.limits.joint
@@ -127,6 +136,7 @@ def setting_items(port: ActuatorPort, settings: BridgeSettings, mapping: EffortM
     if most > settings.limits.effort:
         beside = f"up to {most:.1f} {joint.effort_unit} where the motor brakes at {speed:g} {joint.velocity_unit}"
         effort = replace(effort, seen=f"{effort.seen}, {beside}")
+    acts, none = settings.limits.m_stop, MStopAction.DISABLED
     items = [
         _equal("command lifetime reads back", lifetime, settings.command_lifetime, "s"),
         _equal("feedback rate reads back", rate, settings.feedback_rate, "Hz"),
@@ -134,9 +144,9 @@ def setting_items(port: ActuatorPort, settings: BridgeSettings, mapping: EffortM
         _equal("velocity limit reads back", limits.velocity, settings.limits.velocity, joint.velocity_unit),
         CheckItem(
             "motion stop does what it should",
-            limits.m_stop is settings.limits.m_stop is not MStopAction.DISABLED,
-            limits.m_stop.value,
-            settings.limits.m_stop.value if settings.limits.m_stop is not MStopAction.DISABLED else "an action",
+            limits.m_stop is acts is not none if m_stop else None,
+            limits.m_stop.value if m_stop else "the actuator has none: keep a hand on the switch of its supply",
+            acts.value if acts is not none else "an action",
         ),
     ]
     if settings.gains is not None:

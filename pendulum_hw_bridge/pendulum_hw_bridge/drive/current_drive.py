@@ -25,9 +25,29 @@ _SHARE = 0.1
 
 @dataclass(frozen=True)
 class CurrentMapping(EffortMapping):
-    """Identity within the effort limit; an older setpoint may still show in ``late`` records, by a delay [-]."""
+    """Identity within the effort limit; an older setpoint may still show in ``late`` records, by a delay [-].
+
+    Such drives get a torque alone, so position control is computed here: ``stiffness`` [N m/rad] and ``viscosity``
+    [N m s/rad] on the newest record; 0 for none.
+    """
 
     late: int = 0
+    stiffness: float = 0.0
+    viscosity: float = 0.0
+
+    def follow(self, command: Command, feedback: Feedback) -> tuple[Strategy, Command]:
+        """Return the torque that leads to a position and a velocity; none without a stiffness."""
+        lead = self.stiffness * (command.position - feedback.position)
+        return self.strategy, Command(effort=lead + self.viscosity * (command.velocity - feedback.velocity))
+
+    def handover(self, effort: float, pwm: float, velocity: float, motor: MotorState) -> tuple[float, float]:
+        """Return offset of position [rad] and velocity setpoint [rad/s] that go on with a torque."""
+        return (effort / self.stiffness if self.stiffness else 0.0), velocity
+
+    @property
+    def dither(self) -> float:
+        """No move of the position setpoint: every torque is compared with the measured one."""
+        return 0.0
 
     def bounded(self, command: Command, motor: MotorState) -> Command:
         """Return the effort setpoint within the effort limit; all other setpoints are dropped."""

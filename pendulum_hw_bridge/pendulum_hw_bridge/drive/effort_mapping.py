@@ -18,7 +18,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 from pendulum_hw_bridge.drive.motor_state import MotorState
-from pendulum_hw_bridge.port.actuator import PEAK_EFFORT, Command, Strategy
+from pendulum_hw_bridge.port.actuator import PEAK_EFFORT, Command, Feedback, Strategy
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS, GainSet, limit_output
 from pendulum_msgs_py.contract.joints import ONE_JOINT, Joint
 from pendulum_msgs_py.errors import ParameterError
@@ -163,6 +163,10 @@ class EffortMapping:
         slope = self.gains.velocity.feed_forward * forward + self.gains.velocity.kp
         share = _START_SHARE * self.effort_limit * self.pwm_per_torque(voltage)
         return share / slope if slope > 0.0 else math.inf
+
+    def follow(self, command: Command, feedback: Feedback) -> tuple[Strategy, Command]:
+        """Return strategy and setpoints of position control: strategy 3, as in the thesis."""
+        return Strategy.PARALLEL_PWM, command
 
     @property
     def dither(self) -> float:

@@ -32,10 +32,11 @@ FAULTS = {
     "stop_unacknowledged": "the module did not confirm that it is off; the stop is repeated until it does",
     "supervisor": "a limit that every plant has: velocity, position window, trajectory, age of the measurement",
     "exception": "an error in the bridge itself",
+    "drive_error": "the drive reports an error of its own: it has switched itself off, or is about to",
     "module_lost": "the module is missing, ambiguous, or does not respond",
     "not_prepared": "the drive was released between preparing and arming; arm again",
     "not_connected": "the actuator is used before it is connected",
-    "not_installed": "hebi-py is not installed",
+    "not_installed": "the vendor's library is not installed",
 }
 
 

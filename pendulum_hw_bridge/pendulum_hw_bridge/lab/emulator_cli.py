@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 import signal
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -32,7 +33,16 @@ fault_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 @app.command()
 def emulator(
     address: Annotated[str, typer.Option(help="HOST:PORT to listen on (UDP).")] = _ADDRESS,
-    plant: Annotated[str, typer.Option(help=f"{EMULATOR_PRESET_NAMES}, or a plant file with a drivetrain.")] = "thesis",
+    plant: Annotated[
+        str | None,
+        typer.Option(help=f"{EMULATOR_PRESET_NAMES}, or a plant file with a drivetrain; with --drive any plant."),
+    ] = None,
+    drive: Annotated[
+        str, typer.Option(help="Backend of another drive to emulate: dynamixel, on a pseudo-terminal.")
+    ] = "",
+    link: Annotated[
+        Path | None, typer.Option(help="With --drive: new link to its terminal, under a fixed name.")
+    ] = None,
     position: Annotated[float, typer.Option(help="Where the pendulum is at the start [rad].")] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of sensor noise and timing jitter.")] = 0,
     flat: Annotated[bool, typer.Option(help="The pendulum lies flat: no gravity.")] = False,
@@ -45,7 +55,7 @@ def emulator(
     serial: Annotated[str, typer.Option(help="Serial number that it reports.")] = "X5-9-E0001",
     module_type: Annotated[str, typer.Option(help="Module type that it reports.")] = "X5-9",
 ) -> None:
-    """Serve an emulated X5-9 that goes on when the bridge ends, as a real one does.
+    """Serve an emulated X5-9, or another drive, that goes on when the bridge ends, as a real one does.
 
     Example: python -m pendulum_hw_bridge emulator --plant x5_9 --position 3.14
     """
@@ -61,6 +71,11 @@ def emulator(
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda received, frame: stopped.append(received))
     clock = SteadyWallClock()
+    if drive:
+        with nullcontext() if link is None else _linked(link) as ready:
+            _serve_drive(drive, plant, position, seed, clock, lambda: not stopped, ready or str)
+        return
+    plant = plant or "thesis"
     parameters = replace(load_emulator(plant, heating=heating), flat=flat)
     actuator = EmulatedX5(parameters, seed=seed, position=position, start_ns=clock())
     # Compile before listening: the first seconds would not be in real time.
@@ -74,6 +89,56 @@ def emulator(
     with nullcontext() if truth is None else truth_log(truth) as actuator.trace:
         server.serve(lambda: not stopped)
     print("emulated X5-9 ends", flush=True)
+
+
+@contextmanager
+def _linked(link: Path) -> Iterator[Callable[[str], str]]:
+    """Yield a function that makes a link to a path; the link is removed afterwards."""
+    if link.exists() or link.is_symlink():
+        raise ParameterError(f"link {link} is there already; expected a new one")
+
+    def make(path: str) -> str:
+        link.symlink_to(path)
+        return str(link)
+
+    try:
+        yield make
+    finally:
+        link.unlink(missing_ok=True)
+
+
+def _serve_drive(
+    drive: str,
+    plant: str | None,
+    position: float,
+    seed: int,
+    clock: Callable[[], int],
+    running: Callable[[], bool],
+    name: Callable[[str], str],
+) -> None:
+    from pendulum_hw_bridge.backends import BACKENDS
+    from pendulum_hw_bridge.emulation.dynamixel_servo import EmulatedServo, ServoLine, serve
+    from pendulum_hw_bridge.emulation.machine import EmulatedMachine
+    from pendulum_msgs_py.plants.plant_parameters import load_mechanism
+    from pendulum_msgs_py.programs.realtime import run_ahead, thread_numbers
+
+    drives = [name for name, backend in BACKENDS.items() if backend.torque_drive]
+    if drive not in drives:
+        raise ParameterError(f"drive is {drive!r}; expected one of {', '.join(drives)}")
+    parameters = load_mechanism(plant or str(BACKENDS[drive].defaults["plant"]))
+    start = [position] * len(parameters.joints)
+    machine = EmulatedMachine(parameters, seed=seed, position=tuple(start), start_ns=clock(), rate=1.0)
+    machine.advance_to(clock(), wholly=True)
+    servos = [EmulatedServo(machine, index, number=index + 1) for index in machine.coordinates.driven]
+    numbers = ", ".join(str(servo.number) for servo in servos)
+
+    # A real servo does not compete with other programs for a processor.
+    run_ahead(thread_numbers())
+
+    def ready(path: str) -> None:
+        print(f"emulated {drive} ({parameters.name}), number {numbers}, on {name(path)}", flush=True)
+
+    serve(ServoLine(servos), clock, running, ready)
 
 
 @fault_app.command()

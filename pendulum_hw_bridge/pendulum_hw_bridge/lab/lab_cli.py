@@ -12,10 +12,12 @@ from typing import Annotated, Any
 
 import typer
 
-from pendulum_hw_bridge.backends import hebi
+from pendulum_hw_bridge.backends import BACKENDS, hebi
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleSelection, discover, select_module
+from pendulum_hw_bridge.bridge.assembly import for_plant
 from pendulum_hw_bridge.bridge.bridge_parameters import plant_of
 from pendulum_hw_bridge.bridge.module import DrivenModule
+from pendulum_hw_bridge.bridge.node_specs import SPECS
 from pendulum_hw_bridge.checks.nudge import hand_of
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.lab import guided, module_files, proofs
@@ -24,8 +26,8 @@ from pendulum_hw_bridge.port.clocks import WallClock
 from pendulum_hw_bridge.port.settings import expect_limits
 from pendulum_msgs_py.errors import ParameterError, PendulumError
 from pendulum_msgs_py.json_values import json_text
-from pendulum_msgs_py.plants.lab_file import LabFile, load_lab, write_lab
-from pendulum_msgs_py.plants.plant_parameters import PlantParameters
+from pendulum_msgs_py.plants.lab_file import DRIVES, LabFile, load_lab, write_lab
+from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_plant
 from pendulum_msgs_py.programs.executables import cli_main
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
@@ -70,15 +72,20 @@ class _Terminal:
 @app.command()
 def new(
     file: File,
-    backend: Annotated[str, typer.Option(help="hebi, or emulator_process for a rehearsal.")] = "hebi",
-    interface: Annotated[str, typer.Option(help="Network address to search; empty for all.")] = "",
+    backend: Annotated[str, typer.Option(help="hebi, dynamixel, or emulator_process for a rehearsal.")] = "hebi",
+    interface: Annotated[str, typer.Option(help="Network address to search, empty for all; bus of a drive.")] = "",
+    number: Annotated[int, typer.Option("--id", help="Number of a drive on its bus.", min=0, max=252)] = 1,
     family: Annotated[str, typer.Option(help="HEBI family of the module.")] = "",
     name: Annotated[str, typer.Option(help="HEBI name of the module.")] = "",
     serial: Annotated[str, typer.Option(help="Serial number of the module.")] = "",
     module_type: Annotated[str, typer.Option(help="Type that it must be of; empty for any.")] = "X5-9",
     emulator_address: Annotated[str, typer.Option(help="HOST:PORT of an emulator.")] = "127.0.0.1:17590",
-    plant: Annotated[str, typer.Option(help=f"{EMULATOR_PRESET_NAMES}, or a plant file with a drivetrain.")] = "thesis",
-    effort: Annotated[float, typer.Option(help="Largest torque [N m].", min=0.01)] = 5.0,
+    plant: Annotated[
+        str | None, typer.Option(help=f"{EMULATOR_PRESET_NAMES}, or a plant file with a drivetrain; of a drive any.")
+    ] = None,
+    effort: Annotated[
+        float, typer.Option(help="Largest torque; of a drive at most its plant's [N m].", min=0.01)
+    ] = 5.0,
     supply: Annotated[float, typer.Option(help="Voltage of the supply [V].", min=18.0, max=52.0)] = 36.0,
 ) -> None:
     """Look for the one module that is meant, and write a new lab file for it; nothing moves.
@@ -87,6 +94,9 @@ def new(
     """
     if file.exists():
         raise ParameterError(f"lab file {file} is there already; expected a new one")
+    if backend in DRIVES:
+        _new_drive(file, backend, interface, number, plant or DRIVES[backend], effort)
+        return
     values: dict[str, Any] = {"backend": backend}
     if backend == "hebi":
         modules = discover(hebi.open_lookup(interface), look_time=LOOK_TIME)
@@ -111,7 +121,7 @@ def new(
         effort_limit=effort,
         velocity_limit=1.5,
         position_window=[-4.0, 4.0],
-        plant=plant,
+        plant=plant or "thesis",
         effort_strategy="direct_pwm",
         feedback_rate=100.0,
         command_lifetime=0.05,
@@ -120,6 +130,27 @@ def new(
     )
     write_lab(file, LabFile(values))
     print(f"{file}: {LabFile(values).describe()}")
+    print(as_typed(f"next: python -m pendulum_hw_bridge lab zero {file}"))
+
+
+def _new_drive(file: Path, backend: str, interface: str, number: int, plant: str, effort: float) -> None:
+    """Write the lab file of a drive that answers."""
+    values: dict[str, Any] = {
+        "interface": interface,
+        "drive_id": number,
+        "joint_offset": 0.0,
+        "joint_sign": 1,
+        "plant": plant,
+    }
+    values |= {"backend": backend, "effort_limit": min(effort, load_plant(plant).effort_limit)}
+    values["drive_model"] = BACKENDS[backend].defaults["drive_model"]
+    lab = LabFile(values)
+    defaults = {spec.name: spec.default for spec in for_plant(SPECS, plant, backend)}
+    port = BACKENDS[backend].make({**defaults, **values}, WallClock())
+    with afterwards(port.close):
+        port.connect()
+    write_lab(file, lab)
+    print(f"{file}: {lab.describe()}")
     print(as_typed(f"next: python -m pendulum_hw_bridge lab zero {file}"))
 
 

@@ -8,8 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from pendulum_hw_bridge.backends import hebi
+from pendulum_hw_bridge.backends import BACKENDS, hebi
 from pendulum_hw_bridge.backends.hebi_discovery import LOOK_TIME, ModuleRecord, ModuleSelection, discover, select_module
+from pendulum_hw_bridge.bridge.assembly import for_plant
 from pendulum_hw_bridge.bridge.bridge_parameters import BRIDGE_SPECS
 from pendulum_hw_bridge.port.actuator import ActuatorError
 from pendulum_msgs_py.errors import ParameterError
@@ -28,7 +29,7 @@ EXIT_NONE_CHOSEN = 1
 
 def scan(
     lab: Annotated[Path | None, typer.Option(help="Lab file that says which module is meant.")] = None,
-    backend: Annotated[str | None, typer.Option(help="hebi, or emulator_process for an emulator.")] = None,
+    backend: Annotated[str | None, typer.Option(help="hebi, dynamixel, or emulator_process.")] = None,
     interface: Annotated[
         str | None, typer.Option(help="Network address to search; default all; emulator:HOST:PORT in a rehearsal.")
     ] = None,
@@ -57,14 +58,16 @@ def scan(
     }
     known = {spec.name for spec in BRIDGE_SPECS}
     of_file = {k: v for k, v in load_lab(lab).values.items() if k in known} if lab is not None else {"backend": "hebi"}
-    values = validate(BRIDGE_SPECS, {**of_file, **{k: v for k, v in given.items() if v is not None}})
+    chosen_values = {**of_file, **{k: v for k, v in given.items() if v is not None}}
+    specs = for_plant(BRIDGE_SPECS, "thesis", str(chosen_values.get("backend")))
+    values = validate(specs, chosen_values)
     console = make_console(stderr=True)
     if not as_json:
         console.print(f"looking for {values['backend']} actuators for {look_time:g} s ...", style="dim")
     modules = _modules(values, look_time)
     chosen, reason = None, ""
     try:
-        chosen = select_module(modules, ModuleSelection.of(values), seconds=look_time)
+        chosen = _choose(modules, values, look_time)
     except ActuatorError as error:
         reason = str(error)
     if as_json:
@@ -79,11 +82,28 @@ def scan(
     return 0 if chosen is not None else EXIT_NONE_CHOSEN
 
 
+def _choose(modules: list[ModuleRecord], values: dict[str, Any], look_time: float) -> ModuleRecord:
+    """Return the module that is meant; ActuatorError if there is none."""
+    if not BACKENDS[values["backend"]].torque_drive:
+        return select_module(modules, ModuleSelection.of(values), seconds=look_time)
+    number, model = str(int(values["drive_id"])), values["drive_model"]
+    for module in modules:
+        if (module.serial, module.type) == (number, model):
+            return module
+    seen = ", ".join(f"{module.serial} ({module.type})" for module in modules) or "none"
+    raise ActuatorError("module_lost", f"drives on {values['interface']}: {seen}; expected number {number} ({model})")
+
+
 def _modules(values: dict[str, Any], look_time: float) -> list[ModuleRecord]:
     if values["backend"] == "hebi":
         return discover(hebi.open_lookup(values["interface"]), look_time=look_time, patience=look_time)
+    if BACKENDS[values["backend"]].torque_drive:
+        return [
+            ModuleRecord(drive.family, "", "", drive.serial, drive.model.name, drive.firmware, values["interface"])
+            for drive in BACKENDS[values["backend"]].scan(values)
+        ]
     if values["backend"] != "emulator_process":
-        raise ParameterError(f"backend is {values['backend']!r}; expected hebi or emulator_process, which can be found")
+        raise ParameterError(f"backend is {values['backend']!r}; expected hebi, dynamixel or emulator_process")
     from pendulum_hw_bridge.backends.emulator_process import EmulatorProcessBackend
 
     port = EmulatorProcessBackend(values["emulator_address"], attempts=max(1, round(4 * look_time)))

@@ -29,6 +29,7 @@ from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.parameters import dump_yaml, load_yaml, reject_unknown, require_mapping
 
 __all__ = [
+    "DRIVES",
     "EMULATED_BACKENDS",
     "EMULATED_NETWORK",
     "FORMAT",
@@ -42,6 +43,8 @@ __all__ = [
 FORMAT = "pendulum_lab/1"
 EMULATED_BACKENDS = frozenset({"emulator", "emulator_process"})
 """Backends that emulate a pendulum, which may be pushed and restarted without a prompt; any other is a machine."""
+DRIVES: Mapping[str, str] = MappingProxyType({"dynamixel": "xl330"})
+"""Backends of drives with a current loop, and the preset of a pendulum on each."""
 EMULATED_NETWORK = "emulator:"
 """Prefix of ``interface`` for emulators behind backend ``hebi``: ``emulator:HOST:PORT``."""
 _HEADER = """\
@@ -80,6 +83,9 @@ LAB_ENTRIES: Mapping[str, Mapping[str, LabEntry]] = {
         "type": LabEntry("module_type"),
         "interface": LabEntry("interface"),
         "emulator_address": LabEntry("emulator_address"),
+        "id": LabEntry("drive_id", "", int),
+        "model": LabEntry("drive_model"),
+        "bus_rate": LabEntry("bus_rate", "", int),
     },
     "joint": {
         "zero": LabEntry("joint_offset", "rad", float),
@@ -163,6 +169,8 @@ class LabFile:
     def describe(self) -> str:
         """Return the actuator in a few words, for a question to the operator."""
         values = self.values
+        if values.get("backend") in DRIVES:
+            return f"{values['backend']} number {values.get('drive_id', 1)} on {values.get('interface')}"
         who = f"{values.get('family') or '*'}/{values.get('name') or '*'}"
         marks = [str(values[key]) for key in ("serial", "mac_address") if values.get(key)]
         return f"{values.get('backend', 'hebi')} {who}" + (f" ({', '.join(marks)})" if marks else "")

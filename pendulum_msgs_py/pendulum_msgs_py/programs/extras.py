@@ -11,7 +11,13 @@ PACKAGES = (
     "pendulum_msgs_py", "pendulum_rosbag", "pendulum_sim", "pendulum_lqr", "pendulum_hw_bridge", "pendulum_bags",
     "pendulum_console", "pendulum_learning", "pendulum_course",
 )  # fmt: skip
-_DISTRIBUTIONS = {"foxglove": "foxglove-sdk", "hebi": "hebi-py", "PIL": "pillow", "dask": "distributed"}
+_DISTRIBUTIONS = {
+    "foxglove": "foxglove-sdk",
+    "hebi": "hebi-py",
+    "dynamixel_sdk": "dynamixel-sdk",
+    "PIL": "pillow",
+    "dask": "distributed",
+}
 """Distributions whose name differs from the module's."""
 _REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)[^;]*(?:;.*extra\s*==\s*[\"']([\w-]+)[\"'])?")
 

@@ -34,7 +34,7 @@ from pendulum_bags.experiments.joint_run import (
     load_surrogate,
     surrogate_for,
 )
-from pendulum_bags.experiments.operator import ask_for_running, confirmed
+from pendulum_bags.experiments.operator import ask_for_running, confirmed, real_machine
 from pendulum_bags.experiments.plant_options import AcceptDifferences, AnySimulation, HardwareMapping, MappingFile
 from pendulum_bags.experiments.run_spec import SIDES
 from pendulum_bags.experiments.settings import (
@@ -43,6 +43,8 @@ from pendulum_bags.experiments.settings import (
     SETTLE_TIME,
     NoiseSettings,
     RegulationSettings,
+    is_named,
+    usual_of_drive,
 )
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_msgs_py.plants.plant_parameters import is_mechanism, load_mechanism, write_plant
@@ -83,9 +85,10 @@ def thesis(
     hardware: Annotated[
         str,
         typer.Option(
-            help="emulator, or hebi for the real actuator. Or a second simulation to compare the first with: a model "
-            "file or gymnasium:ID. Or ros:/NAMESPACE for a plant that runs already on --domain. With several joints "
-            "also a preset or plant file of the emulated machine; emulator is one that --share and --delay draw."
+            help="emulator, or hebi for the real actuator, or dynamixel:PORT. Or a second simulation to compare the "
+            "first with: a model file or gymnasium:ID. Or ros:/NAMESPACE for a plant that runs already on --domain. "
+            "With several joints also a preset or plant file of the emulated machine; emulator is one that --share and "
+            "--delay draw."
         ),
     ] = "emulator",
     hardware_mapping: HardwareMapping = None,
@@ -107,8 +110,8 @@ def thesis(
     amplitude: Annotated[
         float | None,
         typer.Option(
-            help="Largest torque of the noise; by default 2.5 N m, with several joints a tenth of the joint's limit "
-            "[N m or N]."
+            help="Largest torque of the noise; by default 2.5 N m, with several joints a tenth of the joint's "
+            "limit, on a drive an eighth [N m or N]."
         ),
     ] = None,
     hold_time: Annotated[float, typer.Option(help="Time for which a noise sample is held [s].")] = 0.01,
@@ -184,9 +187,13 @@ def thesis(
         if design:
             _check_design(design, given)
     else:
-        noise = NoiseSettings(
-            seed, 2.5 if amplitude is None else amplitude, hold_time, 5.0 if duration is None else duration
-        )
+        usual, largest = "thesis", 2.5
+        if (drive := real_machine(hardware, lab)) is not None and drive.is_drive:
+            usual = str(drive.lab.values["plant"])
+            largest, weight = usual_of_drive(given or usual, q[0])
+            r = r if typed_options(context, {"r"}) else weight
+        largest = largest if amplitude is None else amplitude
+        noise = NoiseSettings(seed, largest, hold_time, 5.0 if duration is None else duration)
         own: dict[str, Any] = {
             "effort_strategy": strategy or "",
             "q": q,
@@ -194,7 +201,7 @@ def thesis(
             "lab": str(lab or ""),
             "ramp_speed": ramp_speed,
         }
-        settings = RegulationSettings(given or "thesis", hardware, noise=noise, **own, **sides)
+        settings = RegulationSettings(given or usual, hardware, noise=noise, **own, **sides)
     margins = Margins.of(margins_file, margin)
     budget = budget_of(budget, contenders, seeds, joints=several)
     steps = steps_of(only, budget)
@@ -239,7 +246,7 @@ def _of_joints(
     plant: str, hardware: str, share: float, delay: float, *, noise: NoiseSettings, **given: Any
 ) -> tuple[JointSettings, PlantParameters | None]:
     """Return the settings of a plant of several joints, and the plant of its emulated machine, if it has one."""
-    by_name = hardware.startswith((GRAPH_PREFIX, GYMNASIUM_PREFIX)) or hardware == "hebi"
+    by_name = hardware.startswith((GRAPH_PREFIX, GYMNASIUM_PREFIX)) or (is_named(hardware) and hardware != "emulator")
     is_other = by_name or Path(hardware).suffix.lower() in MODEL_FILES
     settings = JointSettings(plant, noise=noise, hardware=hardware if is_other else "emulator", **given)
     simulated = load_mechanism(plant)

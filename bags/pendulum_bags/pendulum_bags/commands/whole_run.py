@@ -189,7 +189,7 @@ def _print_whole(console: Console, found: Findings, answer: Answer, answers: Seq
 
 
 def _print_summary(console: Console, comparison: Comparison, hardware: str) -> None:
-    from pendulum_bags.experiments.settings import HARDWARE
+    from pendulum_bags.experiments.settings import is_named
     from pendulum_bags.figures.terminal_table import plants_table
     from pendulum_bags.runs.run_data import timing_warning
 
@@ -198,7 +198,7 @@ def _print_summary(console: Console, comparison: Comparison, hardware: str) -> N
     if summary["runs"] > 1:
         title += f", all samples of {summary['runs']} runs"
     plants = summary["plants"]
-    surrogate = "emulator" if hardware in HARDWARE else "a simulation"
+    surrogate = "emulator" if is_named(hardware) else "a simulation"
     headings = [f"hw ({surrogate})" if name == "hw" and emulated else name for name in plants]
     rows = (
         (r"noise recorded \[s]", "duration_s", ".1f"),

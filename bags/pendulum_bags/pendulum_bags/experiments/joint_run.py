@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pendulum_bags.experiments.run_spec import RunSpec
-from pendulum_bags.experiments.settings import NoiseSettings, Sides
+from pendulum_bags.experiments.settings import NoiseSettings, Sides, is_named
 from pendulum_bags.runs.case import IDENTITY
 from pendulum_bags.runs.run_record import RUN_RECORD
 from pendulum_msgs_py.contract.names import JOINT_STATES
@@ -93,10 +93,10 @@ class JointSettings(Sides):
         object.__setattr__(self, "joint", driven_joint(self.plant, self.joint))
         if self.controller not in HOLDING:
             raise ParameterError(f"controller is {self.controller!r}; expected one of {', '.join(HOLDING)}")
-        if self.hardware == "hebi":
+        if is_named(self.hardware) and self.hardware != "emulator":
             raise ParameterError(
-                "hardware is hebi; with several joints start the bridge (python -m pendulum_hw_bridge bridge) and give "
-                "ros:/hw: a person has to hold the plant upright"
+                f"hardware is {self.hardware}; with several joints start the bridge (python -m pendulum_hw_bridge "
+                "bridge) and give ros:/hw: a person has to hold the plant upright"
             )
         self._check_sides(self.noise.hold_time)
 

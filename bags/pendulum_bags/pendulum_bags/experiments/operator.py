@@ -7,7 +7,7 @@ import json
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from rich.console import Console
 from pendulum_bags.experiments.run_spec import EMULATOR_PATIENCE
 from pendulum_bags.recordings.bridge_programs import last_words, run_bridge_program
 from pendulum_msgs_py.errors import FaultError, ParameterError
-from pendulum_msgs_py.plants.lab_file import EMULATED_BACKENDS, LabFile, load_lab
+from pendulum_msgs_py.plants.lab_file import DRIVES, EMULATED_BACKENDS, LabFile, load_lab
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram, ParameterArgument
 from pendulum_msgs_py.programs.terminal import make_console
@@ -26,21 +26,36 @@ __all__ = ["RealMachine", "ask_for_running", "ask_yes", "confirmed", "real_machi
 _CHECK_TIMEOUT = 120.0
 _EXIT_BUSY = 3
 YES = "yes"
+_TERMINALS = "/dev/pts/"
+_REHEARSAL: Mapping[str, ParameterArgument] = {"feedback_watchdog": 10, "command_lifetime": 0.1}
+"""Parameters for a drive on a pseudo-terminal, perhaps emulated on this busy computer; real ones may have them too."""
 
 
 @dataclass(frozen=True)
 class RealMachine:
-    """The machine of a lab file at ``path`` with the content ``lab``."""
+    """The machine of a lab file at ``path``, None for a drive without one, with the content ``lab``."""
 
-    path: Path
+    path: Path | None
     lab: LabFile
+
+    @property
+    def is_drive(self) -> bool:
+        """Whether it is a drive with a current loop, which takes torques as they are."""
+        return self.lab.values["backend"] in DRIVES
 
     def bridge_program(self, strategy: str, bag: Path | None = None) -> NodeProgram:
         """Return the bridge; an emulator's is more patient, a real actuator's own log goes next to ``bag``."""
         patience = EMULATOR_PATIENCE if self.patient else {}
+        if self.is_drive and str(Path(str(self.lab.values["interface"])).resolve()).startswith(_TERMINALS):
+            patience = _REHEARSAL
         parameters = {name: value for name, value in patience.items() if name not in self.lab.values}
         parameters |= self.log_parameters(bag)
-        return graph.bridge("/hw", lab_file=str(self.path), effort_strategy=strategy, **parameters)
+        parameters |= {} if self.path is None else {"lab_file": str(self.path)}
+        if self.is_drive:
+            parameters |= {name: self.lab.values[name] for name in ("backend", "interface", "plant")}
+        else:
+            parameters["effort_strategy"] = strategy
+        return graph.bridge("/hw", **parameters)
 
     def log_parameters(self, bag: Path | None) -> dict[str, ParameterArgument]:
         """Return the parameters for hebi-py's own log next to a bag; empty for an emulator."""
@@ -62,11 +77,25 @@ class RealMachine:
     def effort_limit(self) -> str:
         """Largest torque, as text."""
         limit = self.lab.values.get("effort_limit")
-        return f"{limit:g} N m (lab file)" if limit else "that of the plant file, up to 13 N m"
+        return f"{limit:g} N m (lab file)" if limit else "that of the plant file"
 
 
 def real_machine(hardware: str, lab: str | Path | None) -> RealMachine | None:
-    """Return the machine of ``--hardware hebi --lab FILE``, None for the emulator; or a ParameterError."""
+    """Return the machine of ``--hardware hebi --lab FILE`` or of ``DRIVE:INTERFACE``, None for others.
+
+    Raises:
+        ParameterError: The lab file is missing, refused, or another machine's.
+    """
+    drive, _, interface = hardware.partition(":")
+    if drive in DRIVES:
+        path = Path(lab).expanduser().resolve() if lab else None
+        of_file = LabFile({"backend": drive}) if path is None else load_lab(path)
+        if of_file.values["backend"] != drive:
+            raise ParameterError(f"lab file {path} is of backend {of_file.values['backend']!r}; expected {drive!r}")
+        interface = interface or str(of_file.values.get("interface", ""))
+        if not interface:
+            raise ParameterError(f"hardware is {hardware!r} without its bus; expected {drive}:INTERFACE, or a lab file")
+        return RealMachine(path, LabFile({"plant": DRIVES[drive], **of_file.values, "interface": interface}))
     if hardware != "hebi":
         if lab:
             raise ParameterError(f"lab file {lab} is given with hardware {hardware!r}; expected --hardware hebi")
@@ -94,7 +123,8 @@ def confirmed(
         yield
         return
     console = make_console(stderr=True, highlight=False)
-    with _saved_settings(machine, console):
+    # A drive's settings are written at each arming; nothing of a person's is lost.
+    with contextlib.nullcontext() if machine.is_drive else _saved_settings(machine, console):
         run_checklist(bridge, console, flat=flat)
         ask_yes(machine, plan, console, yes=yes)
         yield
@@ -157,8 +187,10 @@ def _refusals(printed: str, said: str) -> str:
 def ask_yes(machine: RealMachine, plan: str, console: Console, *, yes: bool, read: Callable[[], str] = input) -> None:
     """Print what will move, and wait for the operator's confirmation; a FaultError without it."""
     what = "an EMULATED machine (a rehearsal)" if machine.emulated else "a REAL machine"
-    moves = f"{what}: {machine.lab.describe()}, lab file {machine.path}"
-    _ask(console, moves, plan, f"{machine.effort_limit}. Keep a hand on the motion stop", yes=yes, read=read)
+    file = f", lab file {machine.path}" if machine.path else ""
+    moves = f"{what}: {machine.lab.describe()}{file}"
+    stop = "the switch of its supply" if machine.is_drive else "the motion stop"
+    _ask(console, moves, plan, f"{machine.effort_limit}. Keep a hand on {stop}", yes=yes, read=read)
 
 
 def ask_for_running(places: Sequence[str], domain: int, plan: str, *, yes: bool) -> None:

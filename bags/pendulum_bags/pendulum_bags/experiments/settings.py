@@ -27,7 +27,8 @@ from pendulum_lqr.policies.policy_file import POLICY_SUFFIX, load_policy, policy
 from pendulum_msgs_py.contract.angles import UPRIGHT
 from pendulum_msgs_py.contract.trajectory import MAX_RAMP_VELOCITY, RAMP_INCREMENT, RAMP_PERIOD, Trajectory, thesis_ramp
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.plants.plant_parameters import require_one_joint
+from pendulum_msgs_py.plants.lab_file import DRIVES
+from pendulum_msgs_py.plants.plant_parameters import load_plant, require_one_joint
 from pendulum_msgs_py.programs import graph
 from pendulum_msgs_py.programs.graph import NodeProgram
 from pendulum_sim.simulator.engines import GYMNASIUM_PREFIX
@@ -42,11 +43,19 @@ __all__ = [
     "NoiseSettings",
     "RegulationSettings",
     "Sides",
+    "is_named",
+    "usual_of_drive",
 ]
 
 HARDWARE = ("emulator", "hebi")
 MODEL_FILES = (".xml", ".mjcf", ".urdf", ".fmu")
 DEFAULT_STRATEGY = "direct_pwm"
+OF_DRIVES = "current_loop"
+"""Reported in place of a strategy for drives with a current loop."""
+_DRIVE_BANDWIDTH = 20.0
+"""Natural frequency that the LQR of a drive's pendulum gets by default, a fifth of a usual rate's period [rad/s]."""
+_NOISE_SHARE = 0.125
+"""Default amplitude of the noise on a drive, as a share of its effort limit [-]."""
 SETTLE_TIME = 1.0
 """Time under control before the noise starts [s]."""
 TIME_WITHOUT_NOISE = 47.0
@@ -59,6 +68,20 @@ follows while it also closes the gap to the pendulum's position at up to 0.3 rad
 _LARGEST_OF_LIMIT = 0.9
 """Largest speed of a ramp, as a share of the machine's limit: an upright pendulum is not where the ramp down begins,
 and a refused ramp would release it there."""
+
+
+def is_named(hardware: str) -> bool:
+    """Return whether hardware is the emulator or an actuator, not a model file or a running plant."""
+    return hardware in HARDWARE or hardware.partition(":")[0] in DRIVES
+
+
+def usual_of_drive(plant: str, angle_weight: float) -> tuple[float, float]:
+    """Return amplitude of the noise [N m] and LQR weight R that suit a pendulum on a small drive.
+
+    The thesis's are those of a machine of 13 N m: with them a servo's steps of angle alone would swing its torque.
+    """
+    values = load_plant(plant)
+    return _NOISE_SHARE * values.effort_limit, angle_weight / (values.inertia * _DRIVE_BANDWIDTH**2) ** 2
 
 
 @dataclass(frozen=True)
@@ -130,10 +153,10 @@ class Sides:
         return ""
 
     def _check_sides(self, hold_time: float) -> None:
-        by_name = self.hardware in HARDWARE or self.hardware.startswith((PREFIX, GYMNASIUM_PREFIX))
+        by_name = is_named(self.hardware) or self.hardware.startswith((PREFIX, GYMNASIUM_PREFIX))
         if not by_name and Path(self.hardware).suffix.lower() not in MODEL_FILES:
             raise ParameterError(
-                f"hardware is {self.hardware!r}; expected one of {', '.join(HARDWARE)}, a model file "
+                f"hardware is {self.hardware!r}; expected one of {', '.join((*HARDWARE, *DRIVES))}, a model file "
                 f"({', '.join(MODEL_FILES)}), gymnasium:ID or ros:/NAMESPACE"
             )
         for side, mapping, option in (("sim", self.mapping, "simulation"), ("hw", self.hardware_mapping, "hardware")):
@@ -154,7 +177,7 @@ class Sides:
     def foreign_of(self, side: str) -> ForeignSimulation | None:
         """Return the third-party simulation of a side, ``sim`` or ``hw``, or None."""
         name, mapping = (self.simulation, self.mapping) if side == "sim" else (self.hardware, self.hardware_mapping)
-        if not name or name in HARDWARE or name.startswith(PREFIX):
+        if not name or is_named(name) or name.startswith(PREFIX):
             return None
         return ForeignSimulation(name, mapping, self.plant_of(side))
 
@@ -179,8 +202,8 @@ class RegulationSettings(Sides):
 
     Attributes:
         design: Preset or file that the controller is designed on; empty for the simulated plant.
-        hardware: ``emulator``, ``hebi`` for the machine of a lab file, a second third-party simulation (a model file or
-            ``gymnasium:ID``), or ``ros:/namespace`` for a plant that runs already.
+        hardware: ``emulator``, ``hebi`` for the machine of a lab file, ``dynamixel:PORT`` for a drive, a second
+            third-party simulation (a model file or ``gymnasium:ID``), or ``ros:/namespace`` for a plant that runs.
         lab: The lab file, for ``hebi``.
         effort_strategy: The actuator's conversion of torque into PWM, which changes the plant. Empty for that of the
             lab file, else ``direct_pwm``; read it from :attr:`strategy`.
@@ -301,6 +324,8 @@ class RegulationSettings(Sides):
     def strategy(self) -> str:
         """The actuator's conversion of torque into PWM: as given, as in the lab file, or ``direct_pwm``."""
         machine = self.machine
+        if machine is not None and machine.is_drive:
+            return OF_DRIVES
         of_lab = machine.lab.values.get("effort_strategy", "") if machine is not None else ""
         return self.effort_strategy or of_lab or DEFAULT_STRATEGY
 

@@ -49,6 +49,7 @@ _PACKAGES = (
     "scipy",
     "control",
     "rosbags",
+    "dynamixel-sdk",
     "hebi-py",
     "ros-jazzy-rclpy",
 )
