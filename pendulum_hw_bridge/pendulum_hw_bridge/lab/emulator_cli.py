@@ -7,7 +7,6 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -16,7 +15,7 @@ import typer
 from pendulum_hw_bridge.emulation import EMULATOR_PRESET_NAMES
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_msgs_py.errors import ParameterError
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import Json
 from pendulum_msgs_py.programs.terminal import WholeTable, make_console
 
@@ -25,12 +24,7 @@ __all__ = ["fault_main", "hand_main", "main"]
 _HAND_PATIENCE_NS = 10 * 10**9
 _ADDRESS = "127.0.0.1:17590"
 
-app = typer.Typer(add_completion=False, rich_markup_mode=None)
-hand_app = typer.Typer(add_completion=False, rich_markup_mode=None)
-fault_app = typer.Typer(add_completion=False, rich_markup_mode=None)
 
-
-@app.command()
 def emulator(
     address: Annotated[str, typer.Option(help="HOST:PORT to listen on (UDP).")] = _ADDRESS,
     plant: Annotated[
@@ -141,7 +135,6 @@ def _serve_drive(
     serve(ServoLine(servos), clock, running, ready)
 
 
-@fault_app.command()
 def emulator_fault(
     faults: Annotated[list[str] | None, typer.Argument(help="Names of faults to begin; none lists them.")] = None,
     clear: Annotated[bool, typer.Option("--clear", help="End all faults first.")] = False,
@@ -180,7 +173,6 @@ def emulator_fault(
     print("faults in force: " + (", ".join(backend.status()["faults"]) or "none"))
 
 
-@hand_app.command()
 def emulator_hand(
     clockwise: Annotated[bool, typer.Option("--clockwise", help="The other way.")] = False,
     angle: Annotated[float, typer.Option(help="How far to turn the link [rad].", min=0.01, max=1.0)] = 0.2,
@@ -211,6 +203,6 @@ def emulator_hand(
     print(f"turned by {turned:+.2f} rad, and let go")
 
 
-main = partial(cli_main, app, name="python -m pendulum_hw_bridge emulator")
-hand_main = partial(cli_main, hand_app, name="python -m pendulum_hw_bridge emulator_hand")
-fault_main = partial(cli_main, fault_app, name="python -m pendulum_hw_bridge emulator_fault")
+main = command_line(emulator, "python -m pendulum_hw_bridge emulator")
+hand_main = command_line(emulator_hand, "python -m pendulum_hw_bridge emulator_hand")
+fault_main = command_line(emulator_fault, "python -m pendulum_hw_bridge emulator_fault")

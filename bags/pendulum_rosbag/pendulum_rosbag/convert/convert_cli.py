@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -15,7 +14,7 @@ from rich.progress import TimeRemainingColumn
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.json_values import json_text
 from pendulum_msgs_py.programs.counted_progress import counting_bar
-from pendulum_msgs_py.programs.executables import cli_main
+from pendulum_msgs_py.programs.executables import command_line
 from pendulum_msgs_py.programs.options import Json, out_option
 from pendulum_msgs_py.programs.terminal import make_console
 
@@ -38,12 +37,7 @@ Exclude = Annotated[str, typer.Option(help="Leave out topics that match this pat
 MaxSize = Annotated[float, typer.Option(help="Begin a new file before this one is larger [MB]; 0 for never.")]
 MaxDuration = Annotated[float, typer.Option(help="Begin a new file before this one is longer [s]; 0 for never.")]
 
-convert_app, merge_app, cut_app, filter_app = (
-    typer.Typer(add_completion=False, rich_markup_mode=None) for _ in range(4)
-)
 
-
-@convert_app.command(epilog="Example: python -m pendulum_rosbag convert runs/today/sim -o /tmp/sim --storage sqlite3")
 def convert(
     bag: AnySource,
     output: Output,
@@ -53,11 +47,13 @@ def convert(
     max_duration: MaxDuration = 0.0,
     as_json: Json = False,
 ) -> None:
-    """Write a bag anew: other storage or compression, split or in one file, ordered by log time; ROS 1 bags too."""
+    """Write a bag anew: other storage or compression, split or in one file, ordered by log time; ROS 1 bags too.
+
+    Example: python -m pendulum_rosbag convert runs/today/sim -o /tmp/sim --storage sqlite3
+    """
     _run([bag], output, None, storage, compression, as_json, max_size, max_duration)
 
 
-@merge_app.command(epilog="Example: python -m pendulum_rosbag merge runs/today/sim runs/today/hw -o /tmp/both")
 def merge(
     bags: Annotated[list[Path], typer.Argument(help="Bags, as for convert.")],
     output: Output,
@@ -67,16 +63,15 @@ def merge(
     max_duration: MaxDuration = 0.0,
     as_json: Json = False,
 ) -> None:
-    """Write several bags to one, ordered by log time; the run metadata of each is kept under its name."""
+    """Write several bags to one, ordered by log time; the run metadata of each is kept under its name.
+
+    Example: python -m pendulum_rosbag merge runs/today/sim runs/today/hw -o /tmp/both
+    """
     if len(bags) < 2:
         raise ParameterError("1 bag was named; expected at least 2 to merge")
     _run(bags, output, None, storage, compression, as_json, max_size, max_duration)
 
 
-@cut_app.command(
-    epilog="Example: python -m pendulum_rosbag cut runs/today/sim -o /tmp/noise --from-event noise_start "
-    "--to-event noise_end"
-)
 def cut(
     bag: Source,
     output: Output,
@@ -88,7 +83,10 @@ def cut(
     compression: Compression = "",
     as_json: Json = False,
 ) -> None:
-    """Write the messages of a time span, by log time."""
+    """Write the messages of a time span, by log time.
+
+    Example: python -m pendulum_rosbag cut runs/today/sim -o /tmp/noise --from-event noise_start --to-event noise_end
+    """
     from pendulum_rosbag.convert.rewrite import Choice
     from pendulum_rosbag.reader import read_bag
 
@@ -110,10 +108,6 @@ def cut(
     _run([bag], output, Choice(start_ns=start_ns, stop_ns=stop_ns), storage, compression, as_json)
 
 
-@filter_app.command(
-    epilog="Example: python -m pendulum_rosbag filter runs/today/sim -o /tmp/states -t /sim/joint_states "
-    "--regex '/events$'"
-)
 def filter_topics(
     bag: Source,
     output: Output,
@@ -124,7 +118,10 @@ def filter_topics(
     compression: Compression = "",
     as_json: Json = False,
 ) -> None:
-    """Write the messages of some topics."""
+    """Write the messages of some topics.
+
+    Example: python -m pendulum_rosbag filter runs/today/sim -o /tmp/states -t /sim/joint_states --regex '/events$'
+    """
     from pendulum_rosbag.convert.rewrite import Choice
 
     if not (topics or regex or exclude):
@@ -180,7 +177,7 @@ def _run(
     print(report.sentence())
 
 
-convert_main = partial(cli_main, convert_app, name="python -m pendulum_rosbag convert")
-merge_main = partial(cli_main, merge_app, name="python -m pendulum_rosbag merge")
-cut_main = partial(cli_main, cut_app, name="python -m pendulum_rosbag cut")
-filter_main = partial(cli_main, filter_app, name="python -m pendulum_rosbag filter")
+convert_main = command_line(convert, "python -m pendulum_rosbag convert")
+merge_main = command_line(merge, "python -m pendulum_rosbag merge")
+cut_main = command_line(cut, "python -m pendulum_rosbag cut")
+filter_main = command_line(filter_topics, "python -m pendulum_rosbag filter")
