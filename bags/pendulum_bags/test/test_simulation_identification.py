@@ -11,7 +11,10 @@ mujoco = pytest.importorskip("mujoco")
 from pendulum_bags.commands import identify_cli  # noqa: E402
 from pendulum_bags.identification.joint_recordings import JointRecording  # noqa: E402
 from pendulum_bags.identification.simulation_model import MujocoMotion  # noqa: E402
-from pendulum_bags.identification.simulation_result import identify_simulation  # noqa: E402
+from pendulum_bags.identification.simulation_result import (  # noqa: E402
+    identify_simulation,
+    undetermined_numbers,
+)
 from pendulum_msgs_py.errors import DataError  # noqa: E402
 from pendulum_sim.foreign.model_source import ModelSource  # noqa: E402
 
@@ -152,3 +155,12 @@ def test_a_file_of_two_joints_is_fitted_under_its_own_names(tmp_path):
     assert result.model.coordinates.names == ("arm", "wrist")
     assert result.intervals["body/tip/ipos"].low < 0.25 < result.intervals["body/tip/ipos"].high
     assert not result.refused
+
+
+def test_an_open_inertia_is_no_refusal_and_an_open_mass_is_one(motion):
+    names = dict.fromkeys(("body/link/inertia", "body/link/mass"))
+    result = identify_simulation(motion, [swing(10)], names, extras="friction")
+    wide = {name: replace(one, low=0.0) for name, one in result.intervals.items()}
+    for name, lost in (("body/link/inertia", False), ("body/link/mass", True)):
+        uncertainty = replace(result.uncertainty, intervals={name: wide[name]})
+        assert ("do not determine body/link/mass" in (undetermined_numbers(result.fit, uncertainty) or "")) is lost

@@ -120,6 +120,10 @@ class MujocoMotion:
                 self._cache.popitem(last=False)
         return self._cache[key]
 
+    def forget(self) -> None:
+        """Drop all compiled models."""
+        self._cache.clear()
+
     def run(self, models: Sequence[Any], starts: Array, effort: Array) -> Array:
         """Return motions, shape (c, w, s + 1, 2 n), of c models from starts (c, w, 2 n) under efforts (c, w, s, n)."""
         (c, w), steps, n = starts.shape[:2], effort.shape[2], len(self.joints)

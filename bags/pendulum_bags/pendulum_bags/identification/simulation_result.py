@@ -34,7 +34,7 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.determined import SPAN
 from pendulum_sim.foreign.model_source import ModelParameter
 
-__all__ = ["Identifiability", "SimulationResult", "identifiability", "identify_simulation"]
+__all__ = ["Identifiability", "SimulationResult", "identifiability", "identify_simulation", "undetermined_numbers"]
 
 _ORDER = ("damping", "frictionloss", "inertia", "ipos", "mass", "armature")
 """Which of two numbers that the motion cannot tell apart is fitted: that which comes first here."""
@@ -270,8 +270,8 @@ class SimulationResult(IdentificationResult):
         return target
 
 
-def _lost(found: JointFit, uncertainty: Uncertainty) -> str | None:
-    """Return which positive numbers the recordings leave open, in a sentence."""
+def undetermined_numbers(found: JointFit, uncertainty: Uncertainty) -> str | None:
+    """Return which numbers the recordings leave open, in a sentence; an inertia may be a small part of what moves."""
     model = found.model
     lost = [
         f"{name} ({one.text} {model.unit(name)})"
@@ -313,7 +313,7 @@ def identify_simulation(
     domains = {name: one for name, one in wanted.items() if one is not None}
     shown = identifiability(SimulationModel.of(motion, parameters, domains), recordings, window, propose=not wanted)
     found = identify_motions(
-        SimulationModel.of(motion, shown.fitted, domains), recordings, SimulationResult, _lost,
+        SimulationModel.of(motion, shown.fitted, domains), recordings, SimulationResult, undetermined_numbers,
         held_out=held_out, window=window, extras=extras,
     )  # fmt: skip
     notes = [said for one in recordings if (said := check_efforts(motion, one.name, one.effort)) is not None]
