@@ -10,7 +10,7 @@ mujoco = pytest.importorskip("mujoco")
 
 from pendulum_bags.commands import identify_cli  # noqa: E402
 from pendulum_bags.identification.joint_recordings import JointRecording  # noqa: E402
-from pendulum_bags.identification.simulation_model import MujocoMotion  # noqa: E402
+from pendulum_bags.identification.simulation_model import MujocoMotion, between_steps  # noqa: E402
 from pendulum_bags.identification.simulation_result import (  # noqa: E402
     identify_simulation,
     undetermined_numbers,
@@ -37,12 +37,13 @@ PATHS = {
 NOISE = 3e-4
 
 
-def swing(seed, values=TRUE, *, seconds=8.0, offset=0.0, late=0, zero=0.0, text=ARM):
+def swing(seed, values=TRUE, *, seconds=8.0, offset=0.0, late=0, zero=0.0, quiet=0, text=ARM):
     """Return a recording of a file, made by plain MuJoCo."""
     model = mujoco.MjModel.from_xml_string(text.format(**values))
     data, rng = mujoco.MjData(model), np.random.default_rng(seed)
     count = round(seconds / model.opt.timestep)
     effort = np.repeat(rng.uniform(-2.5, 2.5, (count // 25 + 1, model.nu)), 25, axis=0)[:count]
+    effort[:quiet] = 0.0
     data.qpos[:] = 0.5
     position = np.empty((count, model.nq))
     for k in range(count):
@@ -153,6 +154,7 @@ def test_a_file_of_two_joints_is_fitted_under_its_own_names(tmp_path):
         MujocoMotion(ModelSource(path)), [recording], {"body/tip/ipos": None}, window=0.5, extras="friction"
     )
     assert result.model.coordinates.names == ("arm", "wrist")
+    assert result.next_step("new.xml")[1].endswith("experiment joints --simulation new.xml --plant PLANT")
     assert result.intervals["body/tip/ipos"].low < 0.25 < result.intervals["body/tip/ipos"].high
     assert not result.refused
 
@@ -164,3 +166,25 @@ def test_an_open_inertia_is_no_refusal_and_an_open_mass_is_one(motion):
     for name, lost in (("body/link/inertia", False), ("body/link/mass", True)):
         uncertainty = replace(result.uncertainty, intervals={name: wide[name]})
         assert ("do not determine body/link/mass" in (undetermined_numbers(result.fit, uncertainty) or "")) is lost
+
+
+def test_between_two_steps_a_cubic_motion_is_exact():
+    t, h = 0.1 * np.arange(6), 0.1
+    path = np.stack((t**3 - t, 3.0 * t**2 - 1.0), axis=1)[None, None]
+    at = np.array([[0.0, 0.03, 0.25, 0.31, 0.5]])
+    found = between_steps(path, at / h, h)[0, 0]
+    np.testing.assert_allclose(found[:, 0], at[0] ** 3 - at[0], atol=1e-15)
+    np.testing.assert_allclose(found[[0, 4], 1], [-1.0, -0.25], atol=1e-12)
+
+
+def test_a_lagging_actuator_begins_a_window_with_what_was_commanded_before(tmp_path):
+    lagging = ARM.replace("<motor ", '<general dyntype="filter" dynprm="0.05" ')
+    path = tmp_path / "lag.xml"
+    path.write_text(lagging.format(**TRUE))
+    result = identify_simulation(
+        MujocoMotion(ModelSource(path)),
+        [swing(11, text=lagging, seconds=4.0, quiet=20)],
+        {"body/link/ipos": None},
+        window=0.5,
+    )
+    assert result.model["body/link/ipos"] == pytest.approx(0.45, rel=1e-3)

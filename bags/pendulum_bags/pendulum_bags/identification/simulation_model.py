@@ -26,7 +26,7 @@ from pendulum_sim.foreign.model_source import ModelParameter, ModelSource
 from pendulum_sim.foreign.mujoco_joints import find_joints
 from pendulum_sim.foreign.mujoco_mapping import MujocoMapping
 
-__all__ = ["MujocoMotion", "SimulationModel", "check_alone", "check_efforts"]
+__all__ = ["MujocoMotion", "SimulationModel", "between_steps", "check_alone", "check_efforts"]
 
 _CACHED = 64
 """Compiled models that are kept."""
@@ -124,8 +124,26 @@ class MujocoMotion:
         """Drop all compiled models."""
         self._cache.clear()
 
-    def run(self, models: Sequence[Any], starts: Array, effort: Array) -> Array:
-        """Return motions, shape (c, w, s + 1, 2 n), of c models from starts (c, w, 2 n) under efforts (c, w, s, n)."""
+    @property
+    def lags(self) -> list[float]:
+        """Return the time constant of the filter of each joint's actuator, 0 without one [s]."""
+        model, h, found = self.model, self.timestep, []
+        for joint in self.joints:
+            actuator = joint.actuator
+            lag = 0.0
+            if actuator is not None and model.actuator_actadr[actuator] >= 0:
+                lag = float(model.actuator_dynprm[actuator, 0])
+                if model.actuator_dyntype[actuator] == int(self._mujoco.mjtDyn.mjDYN_FILTER) and lag > h:
+                    # A step of Euler decays as an exact filter that is a little faster.
+                    lag = -h / math.log1p(-h / lag)
+            found.append(lag)
+        return found
+
+    def run(self, models: Sequence[Any], starts: Array, effort: Array, before: Array) -> Array:
+        """Return motions, shape (c, w, s + 1, 2 n), of c models from starts (c, w, 2 n) under efforts (c, w, s, n).
+
+        ``before`` is what the filters of the actuators hold at the start, as an effort, shape (c, w, n).
+        """
         (c, w), steps, n = starts.shape[:2], effort.shape[2], len(self.joints)
         state = np.tile(self._rest, (c * w, 1))
         control = np.zeros((c * w, steps, self.model.nu + self.model.nv))
@@ -143,8 +161,8 @@ class MujocoMotion:
                 continue
             control[..., joint.control] = drive * joint.control_per_torque
             if (act := int(self.model.actuator_actadr[joint.actuator])) >= 0:
-                # Its lag has settled on the effort with which the window begins.
-                state[:, self._act[act]] = control[:, 0, joint.control]
+                held = before[..., i].reshape(-1)
+                state[:, self._act[act]] = joint.sign * held * joint.control_per_torque
         spec = int(self._mujoco.mjtState.mjSTATE_CTRL) | int(self._mujoco.mjtState.mjSTATE_QFRC_APPLIED)
         rows = [model for model in models for _ in range(w)] if len({*map(id, models)}) > 1 else models[0]
         found, _ = self._rollout.rollout(rows, self._threads, state, control, control_spec=spec)
@@ -335,14 +353,19 @@ class SimulationModel(MotionModel):
         starts = states.copy()
         starts[..., :n] -= zero[:, None]
         models = [self.motion.compiled(self.parameters, row[: len(self.parameters)]) for row in values]
-        path = self.motion.run([one or self.motion.model for one in models], starts, effort)
-        found = _between(path, (data.time - first) / h, h)
+        before = np.zeros((len(values), len(first), n))
+        for i, lag in enumerate(self.motion.lags):
+            if lag > 0.0:
+                held = np.array([grid.input(delay, lag)[:, 0, i] for delay in delays])
+                before[..., i] = held[which.reshape(-1)] + push[:, i, None]
+        path = self.motion.run([one or self.motion.model for one in models], starts, effort, before)
+        found = between_steps(path, (data.time - first) / h, h)
         found[..., :n] += zero[:, None, None]
         found[[one is None for one in models]] = np.nan
         return found
 
 
-def _between(path: Array, at: Array, h: float) -> Array:
+def between_steps(path: Array, at: Array, h: float) -> Array:
     """Return a path, shape (c, w, s + 1, 2 n), at fractions of steps of h [s], shape (w, l): (c, w, l, 2 n)."""
     n = path.shape[-1] // 2
     k = np.clip(np.floor(at + 1e-6).astype(int), 0, path.shape[2] - 2)

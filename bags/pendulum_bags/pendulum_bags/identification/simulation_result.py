@@ -227,9 +227,13 @@ class SimulationResult(IdentificationResult):
         """Return what the file, written, is to be tested by, in words and as a command."""
         way = "joints" if len(self.model.coordinates.joints) > 1 else "thesis"
         options = "".join(f" --{name} {shlex.quote(text)}" for name, text in self.simulation.items())
+        which = ""
+        if way == "joints" and "plant" not in self.simulation:
+            options += " --plant PLANT"
+            which = " (PLANT is a preset or plant file whose joints these are)"
         sentence = (
             f"It misses {100.0 * self.explained.share:.2g} % of what straight lines through the windows miss; whether "
-            "that is good enough to design a controller on, no fit can say. Test it under noise it was not fitted to:"
+            f"that is good enough to design a controller on, no fit can say. Test it under noise that is new{which}:"
         )
         return sentence, f"python -m pendulum_bags experiment {way} --simulation {shlex.quote(plant)}{options}"
 
