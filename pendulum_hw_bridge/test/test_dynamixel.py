@@ -417,9 +417,12 @@ def test_an_alert_is_an_error_with_its_cause_while_driving_and_refuses_to_arm_ag
 def test_a_silent_servo_is_named_with_its_line() -> None:
     drive = SteppedServo()
     drive.faults.add(ActuatorFault.FEEDBACK_LOST)
+    before = drive.clock.now_ns()
     with pytest.raises(ActuatorError, match="servo 1 does not answer on loop at 1000000 baud") as caught:
         drive.port.connect()
     assert caught.value.fault == "module_lost"
+    # Three times a reply, and three times the silence after it.
+    assert (drive.clock.now_ns() - before) / 1e9 == pytest.approx(0.3, abs=1e-3)
 
 
 def test_another_model_is_refused_by_name() -> None:
@@ -482,6 +485,52 @@ def test_the_bridges_parameters_name_device_rate_and_servo_and_the_device_is_ope
     port = DynamixelBackend.from_parameters(values, drive.clock)
     assert (port.connect().serial, port.on_this_bus({**values, "drive_id": 1.0}).connect().serial) == ("2", "1")
     assert opened == [("/dev/ttyUSB7", 57600)]
+
+
+def test_a_scan_names_models_that_are_known_and_others_by_their_number(monkeypatch: pytest.MonkeyPatch) -> None:
+    drive = SteppedServo("double_pendulum", position=(0.0, 0.0))
+    drive.line.servos[7] = EmulatedServo(drive.machine, 1, number=7, model=350)
+    line = loop_port(drive.line, drive.clock)
+    monkeypatch.setattr(module, "serial_port", lambda path, rate: line)
+    found = DynamixelBackend.scan({"interface": "loop", "bus_rate": 1_000_000})
+    assert [(each.serial, each.model.name, each.firmware) for each in found] == [
+        ("1", "XL330-M288", "53"),
+        ("7", "number 350", "53"),
+    ]
+    assert not line.is_open
+
+    def missing() -> bool:
+        raise OSError("no such device")
+
+    line.openPort = missing
+    with pytest.raises(ActuatorError, match="serial line failed: no such device"):
+        DynamixelBackend.scan({"interface": "loop", "bus_rate": 1_000_000})
+
+
+def test_a_header_inside_a_packet_is_stuffed_and_taken_out_again() -> None:
+    drive = driven()
+    drive.port.write(Command(effort=-MODELS["XL330-M288"].step))
+    drive.servo.table[104] = 0xFD
+    assert drive.servo.read(102, 3, drive.clock.now_ns()) == b"\xff\xff\xfd"
+    assert record(drive).effort_command == -MODELS["XL330-M288"].step
+
+
+def test_a_line_that_fails_or_is_busy_is_a_fault_of_each_call_and_no_other_error() -> None:
+    drive = driven()
+    drive.port._port.is_using = True
+    with pytest.raises(ActuatorError, match="request to servo 1 could not be sent"):
+        drive.port.read(0.02)
+    drive.port._port.is_using = True
+    with pytest.raises(ActuatorError, match="command to servo 1 could not be sent"):
+        drive.port.write(Command(effort=0.1))
+    drive.port._port.is_using = False
+    drive.faults.add(ActuatorFault.SEND_FAILED)
+    with pytest.raises(ActuatorError, match="serial line failed") as caught:
+        drive.port.read(0.02)
+    assert caught.value.fault == "feedback_lost"
+    # The SDK calls a line busy after an error: it must not stay so.
+    drive.faults.clear()
+    assert drive.port.read(0.02) is not None
 
 
 def test_flash_memory_is_written_only_when_a_setting_differs() -> None:

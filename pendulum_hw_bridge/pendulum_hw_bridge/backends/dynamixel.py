@@ -259,16 +259,14 @@ class DynamixelBackend(TorqueDrive):
             end = self.now_ns() + round(patience * NANOSECONDS)
             while True:
                 reply, result = self._packets.rxPacket(self._port, False)
-                if result == 0 and reply[4] == self._id and int(reply[5]) + 256 * int(reply[6]) == size + 4:
+                if result == 0 and list(reply[4:7]) == [self._id, size + 4, 0]:
                     return bytes(reply[9 : 9 + size]), int(reply[8])
-                if result not in {0, -3002} or self.now_ns() >= end:
+                if self.now_ns() >= end:
                     return None
 
     def _settle(self) -> None:
         """Wait until no reply to an earlier request can come any more."""
         self.clock.wait_until(self.now_ns() + round(_PATIENCE * NANOSECONDS))
-        with self._line("module_lost"):
-            self._port.clearPort()
 
     def _get(self, register: Register) -> int:
         """Read a register; ActuatorError without a reply, or if the servo reports an error of its own."""

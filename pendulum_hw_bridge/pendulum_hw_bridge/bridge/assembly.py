@@ -122,16 +122,25 @@ def assemble(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
         ParameterError: The parameters contradict each other or the plant.
     """
     if BACKENDS[values["backend"]].torque_drive:
-        return _drives(values, lockstep=lockstep)
+        return _drives(values, specs, lockstep=lockstep)
     if is_mechanism(values["plant"]):
         return _several(values, specs, lockstep=lockstep)
     if values["initial_positions"] != [0.0]:
         raise ParameterError("initial_positions is for several joints; expected initial_position for one")
-    defaults = {spec.name: spec.default for spec in specs}
-    for several, one in OF_GROUPS.items():
-        if values[several] != defaults[several]:
-            raise ParameterError(f"{several} is for several joints; expected {one} for one")
+    _refuse_names(values, specs, several=False)
     return _one(values, lockstep=lockstep)
+
+
+def _refuse_names(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, several: bool) -> None:
+    """Refuse names for one module's parameters where there are several joints, and the other way round."""
+    defaults = {spec.name: spec.default for spec in specs}
+    few, many = ("one joint", "several") if several else ("several joints", "one")
+    if several and values["lab_file"]:
+        raise ParameterError(f"lab_file is for {few}; expected its values as parameters for {many}")
+    for of_several, of_one in OF_GROUPS.items():
+        name, other = (of_one, of_several) if several else (of_several, of_one)
+        if values[name] != defaults[name]:
+            raise ParameterError(f"{name} is for {few}; expected {other} for {many}")
 
 
 def _one(values: Mapping[str, Any], *, lockstep: bool) -> Assembly:
@@ -259,8 +268,9 @@ def _several(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, loc
     return Assembly(coordinates, limits, [plant], f"emulated machine {plant.name}", strategy, mappings[0], modules)
 
 
-def _drives(values: Mapping[str, Any], *, lockstep: bool) -> Assembly:
+def _drives(values: Mapping[str, Any], specs: tuple[ParameterSpec, ...], *, lockstep: bool) -> Assembly:
     plant = load_mechanism(values["plant"])
+    _refuse_names(values, specs, several=len(plant.joints) > 1)
     bridge_parameters.require_real_time(values, lockstep=lockstep)
     limits = bridge_parameters.supervisor_limits(
         values, plant.command_limits, push=plant.effort_limits, coordinates=plant.coordinates, lockstep=lockstep

@@ -42,7 +42,7 @@ class DriveAssembly:
     """Modules of a plant's joints; ParameterError if a parameter does not fit the joints or the drives."""
 
     def __init__(self, values: Mapping[str, Any], plant: PlantParameters, limits: PlantLimits) -> None:
-        refuse_slides(plant.coordinates)
+        refuse_slides(plant.coordinates, values["backend"])
         coordinates = plant.coordinates
         if len(coordinates.driven) != len(coordinates.joints):
             free = [name for index, name in enumerate(coordinates.names) if index not in coordinates.driven]
@@ -51,7 +51,12 @@ class DriveAssembly:
                 f"{values['backend']!r}"
             )
         self._values, self._plant, self._limits = values, plant, limits
-        self._joints = [values_of_joint(values, coordinates, index) for index in range(len(coordinates.joints))]
+        # A single joint has its own parameters; the lists are those of several.
+        several = len(coordinates.joints) > 1
+        self._joints = [
+            values_of_joint(values, coordinates, index) if several else dict(values)
+            for index in range(len(coordinates.joints))
+        ]
         self.mappings = [self._mapping(index) for index in range(len(self._joints))]
 
     def modules(self, clock: Clock) -> list[Module]:

@@ -34,13 +34,13 @@ OF_GROUPS = {
 """Parameters of several modules -> those of one."""
 
 
-def refuse_slides(coordinates: Coordinates) -> None:
+def refuse_slides(coordinates: Coordinates, backend: str = "hebi") -> None:
     """Raise ParameterError if a joint slides: modules only turn."""
     for joint in coordinates.joints:
         if joint.unit != "rad":
             raise ParameterError(
-                f"joint {joint.name!r} slides, and a module of backend 'hebi' turns; expected a plant whose joints all "
-                "turn"
+                f"joint {joint.name!r} slides, and a module of backend {backend!r} turns; expected a plant whose "
+                "joints all turn"
             )
 
 
