@@ -6,6 +6,7 @@ import math
 import sys
 from pathlib import Path
 
+from pendulum_bags.experiments.session import LOOP_NICENESS
 from pendulum_msgs_py.plants.plant_parameters import load_plant
 from pendulum_sim.exports.model_files import mjcf
 from pendulum_testing.processes import ProcessGroup, RunningProgram
@@ -16,8 +17,9 @@ EFFORTS = "/robot/effort_controller/commands"
 
 
 def start_robot(processes: ProcessGroup, name: str = "robot", file: str = "plain_plant.py") -> RunningProgram:
-    """Start the node that knows none of our rules."""
-    return processes.start_command([sys.executable, str(Path(__file__).with_name(file))], name=name)
+    """Start the node that knows none of our rules; a robot has a processor of its own."""
+    command = [sys.executable, str(Path(__file__).with_name(file))]
+    return processes.start_command(command, name=name, niceness=LOOP_NICENESS)
 
 
 def adopt(processes: ProcessGroup, namespace: str, **changes: object) -> RunningProgram:
