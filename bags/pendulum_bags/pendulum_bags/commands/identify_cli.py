@@ -133,6 +133,10 @@ def identify(
     context.call_on_close(partial(show_guesses, make_console(stderr=True), readings, write_mapping))
     if model is not None:
         _refuse_unheeded(context, "--model", _FOR_SIMULATION)
+        from pendulum_bags.identification.simulation_result import check_target
+
+        if out:
+            check_target(out, model)
         found_in_file = _of_model(model, model_mapping, plant, parameter, readings, len(data), window)
         written = found_in_file.write(out) if out and not found_in_file.refused else None
         _finish(found_in_file, written, False, as_json)

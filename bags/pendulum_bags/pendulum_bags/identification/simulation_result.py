@@ -34,7 +34,14 @@ from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.determined import SPAN
 from pendulum_sim.foreign.model_source import ModelParameter
 
-__all__ = ["Identifiability", "SimulationResult", "identifiability", "identify_simulation", "undetermined_numbers"]
+__all__ = [
+    "Identifiability",
+    "SimulationResult",
+    "check_target",
+    "identifiability",
+    "identify_simulation",
+    "undetermined_numbers",
+]
 
 _ORDER = ("damping", "frictionloss", "inertia", "ipos", "mass", "armature")
 """Which of two numbers that the motion cannot tell apart is fitted: that which comes first here."""
@@ -209,6 +216,15 @@ class SimulationResult(IdentificationResult):
                 f"The effort acts {1e3 * model[DELAY]:.3g} ms after its stamp; the file does not get that: the loop "
                 "around the simulation delays it, or its actuator does."
             )
+        for one in self._written:
+            value, (low, high) = model[one.name], model.bounds(one.name)
+            if value <= low == 0.0:
+                said.append(f"{one.name} is 0: the recordings want none of it.")
+            elif not low < value < high:
+                said.append(
+                    f"{one.name} ended at the edge of its domain, {value:.4g} {one.unit}: the motion wants "
+                    f"{'less' if value <= low else 'more'}. Some number that is held is wrong: fit it too."
+                )
         said += [f"{one.name} is put into {one.place}." for one in self._written if one.place]
         for one in self._written:
             owner = one.name.split("/")
@@ -259,8 +275,7 @@ class SimulationResult(IdentificationResult):
         source, target = self.model.motion.source, Path(path)
         if self.refused:
             raise DataError(f"{self.refusal} No file is written.")
-        if target.suffix != source.path.suffix:
-            raise DataError(f"--out is {target.name!r}; expected a name that ends in {source.path.suffix}")
+        check_target(target, source.path)
         listing = []
         for one in self._written:
             found = self.intervals.get(one.name)
@@ -274,13 +289,19 @@ class SimulationResult(IdentificationResult):
         return target
 
 
+def check_target(target: Path, model: Path) -> None:
+    """Raise a DataError if a model file cannot be written back under a name."""
+    if target.suffix != model.suffix:
+        raise DataError(f"--out is {target.name!r}; expected a name that ends in {model.suffix}")
+
+
 def undetermined_numbers(found: JointFit, uncertainty: Uncertainty) -> str | None:
     """Return which numbers the recordings leave open, in a sentence; an inertia may be a small part of what moves."""
     model = found.model
     lost = [
         f"{name} ({one.text} {model.unit(name)})"
         for name, one in uncertainty.intervals.items()
-        if name in model.sizes and not (one.low > 0.0 and one.high < SPAN * one.low)
+        if name in model.near and not (one.low > 0.0 and one.high < SPAN * one.low)
     ]
     return f"{REFUSED}: the recordings do not determine {', '.join(lost)}" if lost else None
 
