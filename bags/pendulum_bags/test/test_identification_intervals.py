@@ -10,7 +10,7 @@ import yaml
 from pendulum_bags.identification.covariance import FREQUENCY
 from pendulum_bags.identification.cross_validation import cross_validate, folds
 from pendulum_bags.identification.identify import identify
-from pendulum_bags.identification.model import FRICTION_MODELS, INDEX, from_plant
+from pendulum_bags.identification.model import FRICTION_MODELS, INDEX, TORQUES, from_plant
 from pendulum_bags.identification.options import Options
 from pendulum_bags.identification.output_error import fit_output_error
 from pendulum_bags.identification.selection import akaike_weights, choose
@@ -18,7 +18,7 @@ from pendulum_bags.identification.solver import solve
 from pendulum_bags.identification.uncertainty import unresolved_offset
 from pendulum_bags.identification.window_score import window_score
 from pendulum_bags.runs.read_recording import read_recording
-from pendulum_msgs_py.plants.plant_parameters import pendulum_plant
+from pendulum_msgs_py.plants.plant_parameters import load_plant, pendulum_plant
 from pendulum_testing.identification_truths import OUTSIDE, TRUTHS, covered, outside
 from pendulum_testing.synthetic_recordings import synthetic_recording
 
@@ -153,6 +153,18 @@ def test_the_choice_among_friction_models_is_part_of_the_error():
     for name in ("damping", "coulomb_friction"):
         both = (result.uncertainty.intervals[name], alone.uncertainty.intervals[name])
         assert both[0].standard_error > 1.02 * both[1].standard_error
+
+
+@pytest.mark.parametrize("name", ["quadratic drag", "twice the angle", "three times the angle"])
+def test_a_torque_of_angle_or_velocity_is_chosen_and_written_to_the_plant_file(name, tmp_path):
+    truth = TRUTHS[name]
+    result = identify([truth.recording(0)], profiles=0)
+    (words,) = result.fit.chosen.torques
+    assert name in words
+    assert f"taken, {words}" in " ".join(result.notes)
+    written = load_plant(result.write(tmp_path / "own.yaml"))
+    for parameter in TORQUES[words]:
+        assert getattr(written, parameter) == pytest.approx(getattr(truth.plant, parameter), abs=0.01)
 
 
 @pytest.mark.parametrize("name", sorted(OUTSIDE))

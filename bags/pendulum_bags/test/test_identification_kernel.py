@@ -23,6 +23,11 @@ PLANT = pendulum_plant(
     angle_offset=0.01,
     torque_offset=0.02,
     transport_delay=0.0125,
+    quadratic_drag=0.02,
+    torque_cos_2=0.05,
+    torque_sin_2=-0.1,
+    torque_cos_3=0.03,
+    torque_sin_3=0.04,
 )
 
 
@@ -92,6 +97,11 @@ def test_every_sensitivity_is_the_derivative_of_the_simulation(name, kind):
         "drive_damping": 0.02,
         "drive_load_friction": 0.02,
         "load_stribeck": 0.3,
+        "quadratic_drag": 0.01,
+        "torque_cos_2": 0.05,
+        "torque_sin_2": -0.1,
+        "torque_cos_3": 0.03,
+        "torque_sin_3": 0.04,
     }
     gain = 0.0
     if kind == "position_goal":

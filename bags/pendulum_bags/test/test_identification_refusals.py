@@ -131,7 +131,7 @@ def test_a_plant_that_no_candidate_can_be_is_said_loudly_to_have_no_honest_inter
     rng = np.random.default_rng(1)
     time = np.arange(0.0, 6.0, 0.005)
     effort = multisine(time, 1.2, rng)
-    # Drag that grows with the square of speed is in no candidate.
+    # Drag that grows with the square of speed is no part of a friction model by name.
     theta, omega, angles = 0.0, 0.0, []
     for u in effort:
         angles.append(theta)
@@ -142,7 +142,7 @@ def test_a_plant_that_no_candidate_can_be_is_said_loudly_to_have_no_honest_inter
     position = np.array(angles) + 1e-3 * rng.standard_normal(time.size)
     result = identify([Recording(time, position, None, effort, hold="zero")], QUICK, profiles=0)
     said = result.sentences()
-    assert said[0].startswith("MODEL INCOMPLETE: what the fit leaves over looks like a drag that grows with the square")
+    assert said[0].startswith("MODEL INCOMPLETE: what the fit leaves over looks like quadratic drag")
     assert not any("the intervals allow for it" in sentence for sentence in said)
     assert result.to_dict()["incomplete"]
 

@@ -12,7 +12,7 @@ from pendulum_bags.experiments.in_process import simulate
 from pendulum_bags.experiments.repeats import record_simulation
 from pendulum_bags.experiments.run_spec import RunSpec
 from pendulum_bags.frequency_response.record import INPUT_UNIT, record_of_joints
-from pendulum_bags.identification.identify import identify_joints
+from pendulum_bags.identification.identify import RATIOS, identify_joints
 from pendulum_bags.identification.joint_recordings import read_joints
 from pendulum_bags.recordings.reading import Reading
 from pendulum_bags.replay.joint_replay import replay_joints
@@ -98,8 +98,9 @@ def test_a_plant_is_identified_from_voltages_with_its_motor_given(
     assert found.actuators == truth.actuators
     said = " ".join(result.sentences())
     assert "The motor of arm was given: 0.005 per volt" in said
-    assert "voltages show only ratios" in said
+    assert RATIOS in said
     again, provenance = load_plant_file(result.write(tmp_path / "own.yaml"))
+    assert provenance["scale"] == "ratios only: fixed by the gain of the given motors"
     assert again == found
     # Of the damping without back EMF, as its value is.
     low, high = provenance["intervals"]["arm.damping"]

@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 from pendulum_bags.identification.model import from_plant
 from pendulum_bags.identification.result import IdentificationResult
 from pendulum_bags.runs.datasets import Recording
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant
 from pendulum_testing.synthetic_recordings import multisine, synthetic_recording
 
@@ -31,6 +32,7 @@ NAMES = (
     "angle_offset",
     "torque_offset",
     "transport_delay",
+    *JOINT_TORQUES,
 )
 
 
@@ -85,13 +87,15 @@ TRUTHS: Mapping[str, Truth] = {
     ),
     "Stribeck friction": Truth(PLANT.with_values(static_friction=0.09, stribeck_velocity=0.3)),
     "friction by load": Truth(PLANT.with_values(load_friction=0.04)),
+    "quadratic drag": Truth(PLANT.with_values(quadratic_drag=0.02)),
+    "twice the angle": Truth(PLANT.with_values(torque_cos_2=0.05, torque_sin_2=-0.2)),
+    "three times the angle": Truth(PLANT.with_values(torque_cos_3=0.1, torque_sin_3=0.1)),
 }
 """By name; the truth of each is among the candidates of `identify`."""
 
 OUTSIDE: Mapping[str, Callable[[float, float, float], float]] = {
-    "drag by the square of speed": lambda _u, _theta, omega: -0.02 * omega * abs(omega),
     "a gain that falls with the angle": lambda u, theta, _omega: -0.3 * u * float(np.sin(theta)) ** 2,
-    "a magnet": lambda _u, theta, _omega: -0.2 * float(np.sin(2.0 * theta)),
+    "a friction that differs by direction": lambda _u, _theta, omega: -0.03 * abs(omega),
 }
 """Torques [N m] of input [N m], angle [rad] and velocity [rad/s] that no candidate has."""
 

@@ -26,7 +26,7 @@ _friction = njit(cache=True)(friction_magnitude)
 
 @njit(cache=True)
 def _integrate(effort: Array, period: float, substeps: int, delay: float, state: Array, plant: Array) -> Array:
-    inertia, damping, gravity, coulomb, static, stribeck, load, offset, angle = plant
+    inertia, damping, gravity, coulomb, static, stribeck, load, offset, angle, drag, a_2, b_2, a_3, b_3 = plant
     h = period / substeps
     theta, omega = state[0], state[1]
     out = np.zeros((effort.size, 2))
@@ -42,7 +42,9 @@ def _integrate(effort: Array, period: float, substeps: int, delay: float, state:
                     step = h if stage == 3 else 0.5 * h
                     a, b = theta + step * last_t, omega + step * last_w
                 dry = _friction(b, coulomb, static, stribeck) + load * abs(gravity * math.sin(a - angle))
-                net = u + offset - dry * math.tanh(b / 1e-4)
+                net = u + offset - dry * math.tanh(b / 1e-4) - drag * b * abs(b)
+                x = a - angle
+                net += a_2 * math.cos(2 * x) + b_2 * math.sin(2 * x) + a_3 * math.cos(3 * x) + b_3 * math.sin(3 * x)
                 last_t, last_w = b, _acceleration(a - angle, b, net, inertia, damping, gravity)
                 weight = 1.0 / 3.0 if stage in (1, 2) else 1.0 / 6.0
                 k_theta += weight * last_t
@@ -92,6 +94,11 @@ def synthetic_recording(
             plant.load_friction,
             plant.torque_offset,
             plant.angle_offset,
+            plant.quadratic_drag,
+            plant.torque_cos_2,
+            plant.torque_sin_2,
+            plant.torque_cos_3,
+            plant.torque_sin_3,
         ]
     )
     # The smoothed friction is stiff: its rate is torque over (inertia times 1e-4 rad/s).

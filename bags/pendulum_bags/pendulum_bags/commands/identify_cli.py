@@ -145,7 +145,7 @@ def identify(
         raise DataError("--parameter and --model-mapping have no effect without --model; expected it with them")
     if plant is not None:
         _refuse_unheeded(context, "--plant", _FOR_SEVERAL_JOINTS)
-        from pendulum_bags.identification.identify import identify_joints
+        from pendulum_bags.identification.identify import RATIOS, identify_joints
         from pendulum_bags.identification.joint_recordings import read_joints
         from pendulum_msgs_py.plants.plant_parameters import load_mechanism
 
@@ -153,6 +153,8 @@ def identify(
         if len(start.joints) == 1:
             raise DataError(f"plant {start.name!r} has one joint; expected a mechanism, or no --plant for one joint")
         logs = [read_joints(reading, start.coordinates) for reading in readings]
+        if start.coordinates.volts:
+            make_console(stderr=True).print(RATIOS, highlight=False)
         joints = identify_joints(start, logs[: len(data)], held_out=logs[len(data) :], window=window)
         _finish(joints, joints.write(out, name=name) if out and not joints.refused else None, page, as_json)
         return

@@ -17,7 +17,7 @@ from pendulum_bags.identification.problem import Piece, simulate
 from pendulum_bags.identification.solver import Solution, solve
 from pendulum_bags.identification.window_score import fit_states
 
-__all__ = ["COARSE", "CrossValidation", "cross_validate", "folds"]
+__all__ = ["COARSE", "CrossValidation", "cross_validate", "folds", "predicted"]
 
 COARSE = 3.0
 """Factor on the integration step while searching; the chosen model is fitted to the end without it."""
@@ -58,6 +58,34 @@ def folds(pieces: Sequence[_Cut], count: int = 6) -> list[list[NDArray[np.int64]
     blocks = np.array_split(np.arange(sum(sizes)), number)
     starts = np.concatenate(([0], np.cumsum(sizes)))
     return [[block[(block >= a) & (block < b)] - a for a, b in itertools.pairwise(starts)] for block in blocks]
+
+
+def predicted(
+    windows: Sequence[tuple[Array, Array]], pieces: Sequence[_Cut], columns: Sequence[int], known: Array
+) -> tuple[Array, Array]:
+    """Return the squares of each fold by fits one Gauss-Newton step away, shape (f,), and the step of all data.
+
+    ``windows`` are of :class:`~pendulum_bags.identification.covariance.Information`; of its sensitivities those of
+    some ``columns``, shape (k,), are used. ``known`` weighs what is known beforehand of the first m ones, shape (m,).
+    """
+    every = [(effects[:, columns], errors) for effects, errors in windows]
+    parts = [(effects.T @ effects, effects.T @ errors) for effects, errors in every]
+    matrix = np.diag(np.pad(known, (0, len(columns) - len(known)))) + np.sum([own for own, _ in parts], axis=0)
+    gradient = np.sum([own for _, own in parts], axis=0)
+    firsts = np.cumsum([0, *(len(piece.states) for piece in pieces)])[:-1]
+    squares = []
+    for fold in folds(pieces):
+        out = np.concatenate([own + first for own, first in zip(fold, firsts, strict=True)]).tolist()
+        rest = matrix - np.sum([parts[i][0] for i in out], axis=0)
+        step = _solved(rest, gradient - np.sum([parts[i][1] for i in out], axis=0))
+        squares.append(sum(float(np.sum((every[i][1] - every[i][0] @ step) ** 2)) for i in out))
+    return np.array(squares), _solved(matrix, gradient)
+
+
+def _solved(matrix: Array, gradient: Array) -> Array:
+    size = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    inverse = np.linalg.pinv(matrix * np.outer(size, size), rcond=1e-10, hermitian=True)
+    return np.asarray(size * (inverse @ (size * gradient)))
 
 
 def _refit(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime, timezone
 from typing import Any, TypeVar
@@ -42,13 +42,19 @@ from pendulum_bags.runs.datasets import Recording, distinct_names
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters
 
-__all__ = ["identify", "identify_joints", "identify_motions"]
+__all__ = ["RATIOS", "identify", "identify_joints", "identify_motions"]
 
 R = TypeVar("R", bound=IdentificationResult)
 
 _ONE_MACHINE = {FREQUENCY: 1.1, "inertia": 1.35, "gravity": 1.35}
 """Ratios up to which what differs from recording to recording may be one machine's: what the model lacks moves them."""
 
+
+RATIOS = (
+    "Volts show only ratios of masses, friction and motor: the motor's gain in the plant file fixes their scale, and "
+    "with another all would be larger or smaller alike."
+)
+"""Said of recordings in volts before and after the fit, and in the plant file."""
 
 _ONE_SIZE = 1.1
 """The same for a size of several joints, which share no scale."""
@@ -105,8 +111,8 @@ def identify(
     delay = uncertainty.intervals.get("transport_delay")
     return PendulumResult(
         fit,
-        fit.chosen.friction,
-        {c.friction: (c.validation.rms if c.validation else None, c.training_rms) for c in fit.candidates},
+        fit.chosen.label,
+        {c.label: (c.validation.rms if c.validation else None, c.training_rms) for c in fit.candidates},
         uncertainty,
         account,
         {},
@@ -114,7 +120,10 @@ def identify(
         fit.window,
         _now(),
         tuple(map(fingerprint, fit.recordings)),
-        tuple(data_sentences(fit, delay, refused=account.refusal is not None)),
+        (
+            *data_sentences(fit, delay, refused=account.refusal is not None),
+            *_tried(fit.chosen.gains, fit.chosen.torques),
+        ),
         two,
         tests,
         geometry,
@@ -163,11 +172,10 @@ def _behind_motors(plant: PlantParameters, found: IdentificationResult) -> Ident
         motor = actuator.motor
         assert motor is not None
         notes.append(
-            f"The motor of {name} was given: {motor.gain:.4g} per volt. Of masses, friction and motor, voltages show "
-            f"only ratios; with another motor all would be larger or smaller alike. {name}.damping contains its back "
-            f"EMF, {motor.damping:.3g}, which the plant file has apart."
+            f"The motor of {name} was given: {motor.gain:.4g} per volt. {name}.damping contains its back EMF, "
+            f"{motor.damping:.3g}, which the plant file has apart."
         )
-    found = replace(found, motors=plant, notes=(*notes, *found.notes))
+    found = replace(found, motors=plant, notes=(RATIOS, *notes, *found.notes))
     if not found.refused:
         try:
             found.plant(plant.name)
@@ -261,6 +269,17 @@ def identify_motions(
         tuple(notes),
         two,
     )
+
+
+def _tried(gains: Mapping[str, float], taken: Sequence[str]) -> list[str]:
+    """Return which terms were tried, those in the fit first, with the share of the held-out error that each takes."""
+    listings = [
+        f"{'taken' if inside else 'not taken'}, {', '.join(each)}"
+        for inside in (True, False)
+        if (each := [f"{words} ({100.0 * gain:.2g} %)" for words, gain in gains.items() if (words in taken) == inside])
+    ]
+    said = "Terms that were tried, and by how much each lowers the rms of held-out windows"
+    return [f"{said}: {'; '.join(listings)}."] if listings else []
 
 
 def _notes(recordings: Sequence[JointRecording], pushed: Sequence[tuple[str, float, float]]) -> list[str]:

@@ -2,16 +2,19 @@
 
 The model, in measured coordinates (theta as the encoder says, u as recorded):
 
-    J th'' = e (k m - k_b th') + tau_0 - b th' - G sin(th - th_0) - F(th', th) sgn th'
+    J th'' = e (k m - k_b th') + tau_0 + t(th - th_0) - b th' - G sin(th - th_0) - F(th', th) sgn th'
     m = u(t - d)                                  for a torque or a voltage
     m = V clip(g (u(t - d) - th), -1, 1)          for a servo that follows a set point u
-    F = c + s z + (1 + l_s z) |l G sin(th - th_0) + l_m e k m| + a(|th'|, |G sin(th - th_0)|),  z = exp(-(th'/v_s)^2)
+    F = c + s z + (1 + l_s z) |l G sin(th - th_0) + l_m e k m| + q th'^2 + a(|th'|, |G sin(th - th_0)|),
+    z = exp(-(th'/v_s)^2)
 
-a is the sum of further friction terms (:mod:`pendulum_msgs_py.plants.friction_terms`).
+a is the sum of further friction terms (:mod:`pendulum_msgs_py.plants.friction_terms`), t the periodic torque and q the
+quadratic drag of :mod:`pendulum_msgs_py.dynamics.joint_torques`.
 
 Integrator: second-order leapfrog; the linear damping is exact (exponential), dry friction is a set-valued law
 with true standstill, and a reversal inside a step is split at its instant, so that the solution and its
-derivatives stay continuous in the parameters. A step uses the mean of the input over the step, shifted by the
+derivatives stay continuous in the parameters. Quadratic drag, whose flow is known, acts by half steps before and after
+(Strang splitting). A step uses the mean of the input over the step, shifted by the
 delay: exact for both holds, and differentiable in a fractional delay.
 
 Source: leapfrog with an exponential damping factor as in Hairer, Lubich, Wanner, "Geometric Numerical
@@ -31,6 +34,7 @@ from numba import njit
 from pendulum_bags.arrays import Array
 from pendulum_msgs_py.dynamics import rigid
 from pendulum_msgs_py.dynamics.arithmetic import in_arithmetic
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES
 from pendulum_msgs_py.dynamics.rigid import friction_magnitude, rigid_acceleration
 from pendulum_msgs_py.plants import friction_terms
 from pendulum_msgs_py.plants.friction_terms import TERM_PARAMETERS, added_friction
@@ -48,14 +52,15 @@ PARAMETER_NAMES = (
     "drive_load_friction",
     "load_stribeck",
     "load_friction",
+    *JOINT_TORQUES,
     *(name for name in TERM_PARAMETERS if name != "load_friction"),
 )
 """Order of the parameter vector, that of ``PACKED``; the constants below are its indices, further terms follow."""
-J, B, G, C, S, VS, T0, TH0, K, D, KB, LM, LS, LG = range(14)
-_OWN = 14
+J, B, G, C, S, VS, T0, TH0, K, D, KB, LM, LS, LG, Q, A2, B2, A3, B3 = range(19)
+_OWN = 19
 _FURTHER = len(PARAMETER_NAMES) - _OWN
 # The load's term stands below, where it also knows the load of the drive.
-_OF_TERMS = ("", *PARAMETER_NAMES[1:LG], "", *PARAMETER_NAMES[LG + 1 :])
+_OF_TERMS = ("", *PARAMETER_NAMES[1:LG], *[""] * (_OWN - LG), *PARAMETER_NAMES[_OWN:])
 _acceleration, _friction_magnitude = njit(rigid_acceleration), njit(friction_magnitude)
 _added_friction = njit(added_friction(_OF_TERMS, njit))
 _added_friction_complex = njit(added_friction(_OF_TERMS, lambda magnitude: njit(in_arithmetic(magnitude, cmath))))
@@ -106,6 +111,21 @@ def _input_at(
         return j, values[j], integral[j] + values[j] * since
     slope = (values[j + 1] - values[j]) / (stamps[j + 1] - stamps[j])
     return j, values[j] + slope * since, integral[j] + (values[j] + 0.5 * slope * since) * since
+
+
+@njit(cache=True)
+def _slowed(w: float, h: float, p: Array, columns: Any, dw: Array) -> float:
+    """Return a velocity after a time under quadratic drag alone, and its derivatives in place."""
+    inv = 1.0 / p[J]
+    slow = 1.0 / (1.0 + p[Q] * inv * abs(w) * h)
+    lost = w * abs(w) * h * inv
+    for c in range(dw.size):
+        if c < columns.size and columns[c] == Q:
+            dw[c] -= lost
+        if c < columns.size and columns[c] == J:
+            dw[c] += lost * p[Q] * inv
+        dw[c] *= slow * slow
+    return w * slow
 
 
 @njit(cache=True)
@@ -163,9 +183,13 @@ def simulate_windows(
     # The same of each column; an initial state is in none of them.
     by_force, by_friction, by_rate, by_inverse = np.zeros(width), np.zeros(width), np.zeros(width), np.zeros(width)
     slows = p[S] > 0.0 or p[LS] > 0.0
+    dragged = p[Q] > 0.0
+    turned = p[A2] != 0.0 or p[B2] != 0.0 or p[A3] != 0.0 or p[B3] != 0.0
     for c in range(k):
         if columns[c] == J:
             by_inverse[c] = -inv * inv
+        dragged = dragged or columns[c] == Q
+        turned = turned or A2 <= columns[c] <= B3
         slows = slows or columns[c] == S or columns[c] == LS
     for n in range(windows.shape[0]):
         first, stop = windows[n, 0], windows[n, 1]
@@ -192,6 +216,8 @@ def simulate_windows(
                 mean_d = -(u1 - u0) / h
                 on = enabled[index]
                 u0, area0 = u1, area1
+                if dragged:
+                    w = _slowed(w, 0.5 * h, p, columns, dw)
                 middle = th + 0.5 * h * w
                 sine = math.sin(middle - p[TH0])
                 drive_u, drive_th, level = p[K] * on, 0.0, mean
@@ -208,6 +234,12 @@ def simulate_windows(
                 rate = (p[B] + on * p[KB]) * inv
                 # The torque behind a velocity that does not decay: what the damping takes is exact below.
                 smooth = _acceleration(middle - p[TH0], 0.0, drive + p[T0], 1.0, 0.0, gravity)
+                s_2 = c_2 = s_3 = c_3 = 0.0
+                if turned:
+                    cosine = math.cos(middle - p[TH0])
+                    s_2, c_2 = 2.0 * sine * cosine, cosine * cosine - sine * sine
+                    s_3, c_3 = s_2 * cosine + c_2 * sine, c_2 * cosine - s_2 * sine
+                    smooth += p[A2] * c_2 + p[B2] * s_2 + p[A3] * c_3 + p[B3] * s_3
                 speed = abs(w)
                 bump = math.exp(-((speed / p[VS]) ** 2)) if slows else 0.0
                 # What the gears carry: drive and gravity press the teeth together when they oppose each other.
@@ -265,6 +297,11 @@ def simulate_windows(
                     f_th = drive_th - gravity * cosine
                     fr_th = s_load * gravity * cosine + s_drive * drive_th
                     fr_w = -peak * bump * 2.0 * speed / p[VS] ** 2 * sign
+                    if turned:
+                        f_p[A2], f_p[B2], f_p[A3], f_p[B3] = c_2, s_2, c_3, s_3
+                        slope = 2.0 * (p[B2] * c_2 - p[A2] * s_2) + 3.0 * (p[B3] * c_3 - p[A3] * s_3)
+                        f_p[TH0] -= slope
+                        f_th += slope
                     if _FURTHER > 0:
                         by_speed, by_weight = _derivatives_of_terms(speed, abs(gravity * sine), p, fr_p)
                         fr_w += by_speed * sign
@@ -303,7 +340,7 @@ def simulate_windows(
                             dth[c] += 0.5 * h * (share * dw[c] + (1.0 - share) * d_w2 + d_share * (w - w2))
                             dw[c] = d_w2
                 th += 0.5 * h * (share * w + ((1.0 - share) * w2 if crossing else w2))
-                w = w2
+                w = _slowed(w2, 0.5 * h, p, columns, dw) if dragged else w2
             theta[i], omega[i] = th, w
             if want:
                 jacobian[i, :] = dth

@@ -8,22 +8,25 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.distributions import student_quantile
-from pendulum_bags.identification.model import FitModel
+from pendulum_bags.identification.model import TORQUES, FitModel
 from pendulum_bags.identification.problem import Piece
 from pendulum_bags.identification.starts import bumps
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES
 
 __all__ = ["missing_torques"]
 
 _LEVEL = 0.01
 
 
-def missing_torques(model: FitModel, pieces: Sequence[Piece], parts: Sequence[Array]) -> list[str]:
+def missing_torques(
+    model: FitModel, pieces: Sequence[Piece], parts: Sequence[Array], free: Sequence[str] = ()
+) -> list[str]:
     """Return in words the torques that the residuals show, such as drag by the square of speed; none for noise.
 
     To first order a residual r, simulated minus measured [rad], obeys J r'' + b r' + G cos(th) r = (missing torque).
     Its left side comes from the same modulating functions as the starts. It is regressed on torques that a pendulum may
-    have and the candidates have not, next to those that they have; sums over blocks longer than the filter judge them,
-    at 1 % over all. Noise of the sensor and torques that have nothing to do with the motion show none.
+    have and the fit of ``free`` parameters has not, next to those that it has; sums over blocks longer than the filter
+    judge them, at 1 % over all. Noise of the sensor and torques that have nothing to do with the motion show none.
 
     Source:
         Engle, Wald, likelihood ratio, and Lagrange multiplier tests in econometrics, Handbook of Econometrics 2, 1984
@@ -33,7 +36,7 @@ def missing_torques(model: FitModel, pieces: Sequence[Piece], parts: Sequence[Ar
     known: list[Array] = []
     added: list[Array] = []
     for piece, part in zip(pieces, parts, strict=True):
-        rows = _rows(model, piece, part)
+        rows = _rows(model, piece, part, free)
         for own, every in zip(rows, (left, known, added), strict=True):
             every.extend(own)
     if not left:
@@ -46,13 +49,15 @@ def missing_torques(model: FitModel, pieces: Sequence[Piece], parts: Sequence[Ar
     basis = basis[:, singular > 1e-6 * singular[0]]
     response = response - basis @ (basis.T @ response)
     found = []
-    for i, words in enumerate(_WORDS):
-        term = candidates[:, i]
-        rest = term - basis @ (basis.T @ term)
-        if np.linalg.norm(rest) < 0.02 * np.linalg.norm(term) or not np.any(term):
+    for words, index in _COLUMNS.items():
+        terms = candidates[:, index]
+        rest = terms - basis @ (basis.T @ terms)
+        if np.linalg.norm(rest) < 0.02 * np.linalg.norm(terms) or not np.any(terms):
             # The motion cannot tell it from what the model has.
             continue
-        product = rest * response
+        # Of two amplitudes the combination that explains most: to be as rare by luck as one, it needs a stricter level.
+        product = rest @ np.linalg.lstsq(rest, response, rcond=None)[0] * response
+        tests = len(_COLUMNS) * len(index) ** 2
         start, sums = 0, []
         for one in left:
             edges = np.arange(0, one.size, max(1, one.size // 5))
@@ -62,27 +67,29 @@ def missing_torques(model: FitModel, pieces: Sequence[Piece], parts: Sequence[Ar
         # Each block leaves out its own mean when the spread is taken, or a large dependence would hide itself.
         spread = float(np.std(values, ddof=1) * np.sqrt(values.size)) if values.size > 5 else np.inf
         if spread > 0.0 and abs(values.sum()) / spread > student_quantile(
-            1.0 - 0.5 * _LEVEL / len(_WORDS), max(values.size - 1, 1)
+            1.0 - 0.5 * _LEVEL / tests, max(values.size - 1, 1)
         ):
             found.append(words)
     return found
 
 
-_WORDS = (
-    "a drag that grows with the square of speed",
-    "a torque of twice the angle's period (an eccentric gear, a magnet)",
-    "a friction that differs by direction",
-    "a spring that goes on with the angle",
-    "a gain that changes with the angle",
-    "a gain that changes with the input (saturation)",
-    "a drive that fades with speed",
-)
+_COLUMNS = {
+    **dict(zip(TORQUES, ([0], [1, 2], [3, 4]), strict=True)),
+    "a friction that differs by direction": [5],
+    "a spring that goes on with the angle": [6],
+    "a gain that changes with the angle": [7],
+    "a gain that changes with the input (saturation)": [8],
+    "a drive that fades with speed": [9],
+}
+"""Columns of each torque, in words; the first ones are fitted where held-out windows ask for them."""
 
 _FILTER = 0.1
 """Length of the modulating functions [s]."""
 
 
-def _rows(model: FitModel, piece: Piece, part: Array) -> tuple[list[Array], list[Array], list[Array]]:
+def _rows(
+    model: FitModel, piece: Piece, part: Array, free: Sequence[str]
+) -> tuple[list[Array], list[Array], list[Array]]:
     recording = piece.recording
     period = recording.period
     count = max(7, round(_FILTER / period) | 1)
@@ -123,10 +130,11 @@ def _rows(model: FitModel, piece: Piece, part: Array) -> tuple[list[Array], list
             np.gradient(u),
             np.abs(gravity) * direction,
         )
-        known.append(np.stack([*map(smooth, own), smooth(angle, second)], axis=1))
+        torques = (speed * np.abs(speed), *(f(k * angle) for k in (2.0, 3.0) for f in (np.cos, np.sin)))
+        fitted = [values for name, values in zip(JOINT_TORQUES, torques, strict=True) if name in free]
+        known.append(np.stack([*map(smooth, (*own, *fitted)), smooth(angle, second)], axis=1))
         others = (
-            speed * np.abs(speed),
-            np.sin(2.0 * angle),
+            *torques,
             np.abs(speed),
             angle,
             u * np.cos(angle),

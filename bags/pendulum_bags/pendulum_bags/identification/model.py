@@ -11,6 +11,7 @@ import numpy as np
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.arrowhead import Model
 from pendulum_bags.identification.kernel import PARAMETER_NAMES
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES, PERIODIC
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.friction_terms import FRICTION_TERMS
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, pendulum_plant
@@ -22,6 +23,7 @@ __all__ = [
     "INDEX",
     "PLANT_FRICTION_MODELS",
     "SERVO_ONLY",
+    "TORQUES",
     "UNITS",
     "FitModel",
     "from_plant",
@@ -50,6 +52,8 @@ _QUANTITIES: Mapping[str, tuple[str, float, float, float]] = {
     "drive_damping": ("N m s/rad", 0.0, 1e3, 0.0),
     "drive_load_friction": ("-", 0.0, 0.9, 0.0),
     "load_stribeck": ("-", 0.0, 10.0, 0.0),
+    "quadratic_drag": ("N m s^2/rad^2", 0.0, 1e3, 0.0),
+    **dict.fromkeys(PERIODIC, ("N m", -1e3, 1e3, 0.0)),
     # A strength may be 0; what gives a term its form stays within a thousandth and a thousandfold of its default.
     **{name: (quantity.unit, 1e-3 * value, 1e3 * value or 1e3, value) for name, (value, quantity) in _FURTHER.items()},
 }
@@ -57,7 +61,13 @@ _QUANTITIES: Mapping[str, tuple[str, float, float, float]] = {
 
 UNITS: Mapping[str, str] = {name: unit for name, (unit, *_) in _QUANTITIES.items()}
 BOUNDS: Mapping[str, tuple[float, float]] = {name: (low, high) for name, (_, low, high, _) in _QUANTITIES.items()}
-_PER_INERTIA = {"kg m^2": "1", "N m": "1/s^2", "N m s/rad": "1/s", "N m per unit of input": "1/s^2 per unit of input"}
+_PER_INERTIA = {
+    "N m s^2/rad^2": "1/rad",
+    "kg m^2": "1",
+    "N m": "1/s^2",
+    "N m s/rad": "1/s",
+    "N m per unit of input": "1/s^2 per unit of input",
+}
 
 _STRIBECK = ("coulomb_friction", "stribeck_excess", "stribeck_velocity")
 _GEAR = ("load_friction", "drive_load_friction")
@@ -78,6 +88,13 @@ FRICTION_MODELS: Mapping[str, tuple[str, ...]] = {
 SERVO_ONLY = ("stribeck_gear_load", "gear_load_stribeck")
 """Models of geared servos that are offered, but not tried, for other drives: seldom determined there."""
 
+TORQUES: Mapping[str, tuple[str, ...]] = {
+    "quadratic drag": ("quadratic_drag",),
+    "a torque of twice the angle": PERIODIC[:2],
+    "a torque of three times the angle": PERIODIC[2:],
+}
+"""Torques that may be fitted besides a friction model, in words."""
+
 PLANT_FRICTION_MODELS = ("viscous", "coulomb", "stribeck", "load", "stribeck_load", *FURTHER_TERMS)
 """Those that a plant file can hold: its friction knows the load of gravity, not that of the drive."""
 
@@ -85,7 +102,7 @@ _DEFAULTS = {name: default for name, (*_, default) in _QUANTITIES.items()}
 _SIZES = {"transport_delay": 1e-2, "angle_offset": 1e-1, "stribeck_velocity": 1e-1}
 _SHARED = (
     *("inertia", "damping", "gravity", "coulomb_friction", "stribeck_velocity", "load_friction", "torque_offset"),
-    *("angle_offset", *_FURTHER),
+    *("angle_offset", *JOINT_TORQUES, *_FURTHER),
 )
 """Parameters that the plant has by the same name."""
 

@@ -9,22 +9,27 @@ import numpy as np
 
 from pendulum_bags.arrays import Array
 from pendulum_bags.identification.arrowhead import robust_cost
-from pendulum_bags.identification.cross_validation import COARSE, cross_validate
-from pendulum_bags.identification.model import FRICTION_MODELS, FURTHER_TERMS, SERVO_ONLY, FitModel
+from pendulum_bags.identification.covariance import information
+from pendulum_bags.identification.cross_validation import COARSE, cross_validate, predicted
+from pendulum_bags.identification.model import BOUNDS, FRICTION_MODELS, FURTHER_TERMS, SERVO_ONLY, TORQUES, FitModel
 from pendulum_bags.identification.options import DEFAULTS, Geometry, Options, default_window
 from pendulum_bags.identification.own_offsets import OwnOffsets, align
 from pendulum_bags.identification.problem import Piece, prepare
 from pendulum_bags.identification.readings import misfit_cause
 from pendulum_bags.identification.selection import Candidate, by_window, choose, effective_samples
-from pendulum_bags.identification.solver import Solution, refine, residuals, solve
+from pendulum_bags.identification.solver import Solution, angle_motions, refine, residuals, solve
 from pendulum_bags.identification.starts import first_models, rank
 from pendulum_bags.runs.datasets import Recording
+from pendulum_msgs_py.dynamics.joint_torques import JOINT_TORQUES
 from pendulum_msgs_py.errors import DataError
 
 __all__ = ["DEFAULTS", "OFFSETS", "Geometry", "Options", "OutputErrorFit", "fit_output_error"]
 
 OFFSETS = ("angle_offset", "torque_offset")
 """What may be left out: zero errors of the angle and of the torque."""
+
+_PROMISING = 0.01
+"""Share by which a torque must promise to lower the held-out rms to be fitted."""
 
 _FRICTION_STARTS: Mapping[str, tuple[Mapping[str, float], ...]] = {
     # As shares of the Coulomb friction found before, and velocities in rad/s.
@@ -110,16 +115,28 @@ def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULT
     elif options.friction == "auto":
         left_out = {*FURTHER_TERMS, *(() if fixed.input_kind == "position_goal" else SERVO_ONLY)}
         names = [name for name in FRICTION_MODELS if name not in left_out]
-    free, best, offsets = _offsets(best, pieces, free, scale, options)
+    gains: dict[str, float] = {}
+    starts, own = [best], list[tuple[str, ...]]([()])
+    if options.friction == "auto" and reading is None and fixed.input_kind != "position_goal":
+        turned, torques, gains = _torques(best, pieces, free, scale, options)
+        if torques:
+            # Friction and offsets are chosen with them and without: either may stand in for the other.
+            starts, own = [best, turned], [(), torques]
     candidates: list[Candidate] = []
-    inner: list[Candidate] = []
-    if names[0] != "viscous":  # friction by name: what every other one contains is tried before it all the same
-        inner = [_fit_friction("viscous", best, pieces, free, scale, (), replace(options, folds=1))]
-    for name in names:
-        candidates.append(_fit_friction(name, best, pieces, free, scale, [*inner, *candidates], options))
+    tried = []
+    for start, torques in zip(starts, own, strict=True):
+        kept, begin, offsets = _offsets(start, pieces, (*free, *torques), scale, options)
+        inner: list[Candidate] = []
+        if names[0] != "viscous":  # friction by name: what every other one contains is tried before it all the same
+            inner = [_fit_friction("viscous", begin, pieces, kept, scale, (), replace(options, folds=1))]
+        for name in names:
+            inner.append(_fit_friction(name, begin, pieces, kept, scale, inner, options))
+        tried.append((inner[-len(names) :], offsets))
+        candidates += tried[-1][0]
     first = choose(candidates)
-    chosen = _finish(first, pieces, scale)
-    candidates[candidates.index(first)] = chosen
+    offsets = next(these for some, these in tried if any(one is first for one in some))
+    chosen = replace(_finish(first, pieces, scale), gains=gains)
+    candidates[[one is first for one in candidates].index(True)] = chosen
     flipped = fixed.input_kind in {"effort", "voltage"} and chosen.solution.model["input_gain"] < 0.0
     return OutputErrorFit(
         chosen,
@@ -134,6 +151,55 @@ def fit_output_error(recordings: Sequence[Recording], options: Options = DEFAULT
         zeros=zeros,
         recordings=tuple(recordings),
     )
+
+
+def _torques(
+    best: Solution, pieces: Sequence[Piece], free: Sequence[str], scale: float, options: Options
+) -> tuple[Solution, tuple[str, ...], dict[str, float]]:
+    """Return a fit with the torques that held-out windows ask for, their parameters, and what each tried one brings.
+
+    To first order the sensitivities show what each would bring; what promises little is not fitted. Schwarz's penalty
+    keeps few that are chosen by luck. The third is the share by which each lowers the held-out rms.
+    """
+    own: tuple[str, ...] = ()
+    gains: dict[str, float] = {}
+    chosen = _fit_friction("coulomb", best, pieces, free, scale, (), options)
+    for _ in TORQUES:
+        if chosen.validation is None:
+            break
+        fits = []
+        for words, gain in _promised(chosen, pieces, scale).items():
+            gains.setdefault(words, max(gain, 0.0))
+            if gain > _PROMISING:
+                names = (*free, *own, *TORQUES[words])
+                fit = _fit_friction("coulomb", chosen.solution, pieces, names, scale, (), options)
+                gains[words] = max(gains[words], 1.0 - fit.score / chosen.score)
+                # What is there shows in every part of the data; what is there by luck does not.
+                if fit.validation is not None and np.all(fit.validation.losses < chosen.validation.losses):
+                    fits.append(fit)
+        better = choose([chosen, *fits], strict=True)
+        if better is chosen:
+            break
+        chosen = better
+        own = tuple(name for name in chosen.free if name in JOINT_TORQUES)
+    return (chosen.solution if own else best), own, gains
+
+
+def _promised(candidate: Candidate, pieces: Sequence[Piece], scale: float) -> dict[str, float]:
+    """Return the share by which each torque that it has not lowers the held-out rms of a candidate, to first order."""
+    solution, k = candidate.solution, len(candidate.free)
+    model, found = solution.model, {}
+    motions = angle_motions(model, pieces, scale, COARSE)
+    names = (*candidate.free, *(name for name in JOINT_TORQUES if name not in candidate.free))
+    seen = information([model] * len(pieces), motions, solution.states, names)
+    before, _ = predicted(seen.windows, pieces, range(k), np.zeros(0))
+    for words, own in TORQUES.items():
+        if set(own) <= set(candidate.free):
+            continue
+        after, step = predicted(seen.windows, pieces, [*range(k), *(names.index(name) for name in own)], np.zeros(0))
+        allowed = all(-value >= BOUNDS[name][0] for name, value in zip(own, step[k:], strict=True))
+        found[words] = 1.0 - float(np.sqrt(after.sum() / before.sum())) if allowed and before.any() else 0.0
+    return found
 
 
 def _frame(recordings: Sequence[Recording], options: Options) -> tuple[FitModel, tuple[str, ...]]:

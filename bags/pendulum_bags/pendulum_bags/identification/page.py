@@ -160,11 +160,11 @@ def _residual_figure(result: PendulumResult) -> Canvas:
 def _candidate_figure(result: PendulumResult) -> Canvas:
     figure = Canvas(figsize=(9.0, 2.6), layout="constrained")
     axes = figure.subplots()
-    names = [c.friction for c in result.fit.candidates]
+    names = [c.label for c in result.fit.candidates]
     place = np.arange(len(names))
     axes.bar(place - 0.2, [1e3 * c.training_rms for c in result.fit.candidates], 0.4, color=_MEASURED, label="training")
     axes.bar(place + 0.2, [1e3 * c.score for c in result.fit.candidates], 0.4, color=_SIMULATED, label="held out")
-    axes.set_xticks(place, [f"{n} (chosen)" if n == result.fit.chosen.friction else n for n in names])
+    axes.set_xticks(place, [f"{n} (chosen)" if n == result.fit.chosen.label else n for n in names])
     axes.set_ylabel("angle rms [mrad]")
     axes.legend()
     return figure

@@ -14,6 +14,7 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.identification import kernel
 from pendulum_bags.identification.model import FitModel
 from pendulum_bags.runs.datasets import Recording, gaps
+from pendulum_msgs_py.dynamics.joint_torques import PERIODIC
 from pendulum_msgs_py.errors import DataError
 
 __all__ = [
@@ -180,6 +181,8 @@ def longest_step(model: FitModel, recording: Recording) -> float:
     """
     inertia = model["inertia"]
     stiffness = abs(model["gravity"])
+    for order, pair in ((2.0, PERIODIC[:2]), (3.0, PERIODIC[2:])):
+        stiffness += order * math.hypot(*(model[name] for name in pair))
     rate = model["damping"] / inertia
     if model.input_kind == "position_goal":
         stiffness += abs(model["input_gain"]) * _supply(recording) * _servo_gain(model, recording)

@@ -108,7 +108,8 @@ def residual_tests(fit: OutputErrorFit) -> ResidualTests:
     elif fit.pieces[0].recording.input_kind == "position_goal":
         missing = ()
     else:
-        missing = missing_torques(fit.model, fit.pieces, parts)
+        shown = missing_torques(fit.model, fit.pieces, parts, fit.free)
+        missing = [words for words in shown if words not in fit.chosen.gains]
     # Windows at rest fit to the last digit, and would make every motion stand out.
     moving = [value for value in rms if value > 1e-6 * max(rms)]
     middle = float(np.median(moving)) if moving else 0.0

@@ -251,7 +251,7 @@ class IdentificationResult:
         assert isinstance(self.fit, JointFit)
         own = dict(zip(self.fit.own, self.fit.offsets.T.tolist(), strict=True))
         assert isinstance(self.fit.model, JointModel)
-        return {"mechanism": self.fit.model.plant.mechanism.name, "own_offsets": own}
+        return {"mechanism": self.fit.model.plant.mechanism.model, "own_offsets": own}
 
     def write(self, path: str | Path, *, name: str = "identified") -> Path:
         """Write the plant file, ``*.yaml``, with intervals and provenance, and all the rest as JSON of the same name.
@@ -291,7 +291,8 @@ class IdentificationResult:
             if braking and name in intervals:
                 low, high = intervals[name]
                 intervals[name] = (max(0.0, low - braking), high - braking)
-        return intervals, {"not_in_the_plant": left_out}, []
+        scale = {} if self.motors is None else {"scale": "ratios only: fixed by the gain of the given motors"}
+        return intervals, {**scale, "not_in_the_plant": left_out}, []
 
 
 @dataclass(frozen=True)
@@ -400,7 +401,7 @@ class PendulumResult(IdentificationResult):
             "own_zeros": None if zeros is None else {"name": zeros.names[0], "values": zeros.values[:, 0].tolist()},
             "profiles": {n: list(p) for n, p in self.uncertainty.profiles.items()},
             "predicted_half_widths": self.predicted,
-            "candidate_parameters": {c.friction: {n: c.solution.model[n] for n in c.free} for c in self.fit.candidates},
+            "candidate_parameters": {c.label: {n: c.solution.model[n] for n in c.free} for c in self.fit.candidates},
             "residuals": {
                 "white": self.tests.white,
                 "white_p": self.tests.white_p,

@@ -17,6 +17,7 @@ from pendulum_bags.identification.output_error import OFFSETS, OutputErrorFit
 from pendulum_bags.identification.residual_tests import ResidualTests
 from pendulum_bags.identification.selection import Candidate, akaike_weights, at_bounds
 from pendulum_bags.identification.solver import solve
+from pendulum_msgs_py.dynamics.joint_torques import PERIODIC
 
 __all__ = ["Uncertainty", "assess", "profile_interval", "unresolved_offset"]
 
@@ -224,7 +225,7 @@ def unresolved_offset(fit: OutputErrorFit) -> str | None:
 
 
 def _positive(name: str) -> bool:
-    return name not in {"torque_offset", "angle_offset", "input_gain", "transport_delay"}
+    return name not in {"torque_offset", "angle_offset", "input_gain", "transport_delay", *PERIODIC}
 
 
 def _torque_scale(fit: OutputErrorFit, name: str) -> float:
