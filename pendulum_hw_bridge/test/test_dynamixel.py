@@ -17,7 +17,7 @@ from pendulum_hw_bridge.backends.torque_drive import TORQUE_LOOP
 from pendulum_hw_bridge.emulation.dynamixel_servo import EmulatedServo, ServoLine, checksum, serve
 from pendulum_hw_bridge.emulation.faults import ActuatorFault
 from pendulum_hw_bridge.emulation.machine import EmulatedMachine
-from pendulum_hw_bridge.port.actuator import ActuatorError, Command, Feedback, HardwareLimits, Strategy
+from pendulum_hw_bridge.port.actuator import ActuatorError, Command, CommandLock, Feedback, HardwareLimits, Strategy
 from pendulum_hw_bridge.port.clocks import WallClock
 from pendulum_hw_bridge.port.gains import DEFAULT_GAINS
 from pendulum_msgs_py.contract.timing import SteadyWallClock
@@ -359,6 +359,57 @@ def test_commands_expire_although_requests_go_on() -> None:
     assert port.read(0.05) is not None
     assert goal(drive) == 0
     assert drive.expiries == 0
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda port: port.set_limits(HardwareLimits(effort=0.3)),
+        lambda port: port.set_command_lifetime(0.06),
+    ],
+)
+def test_settings_of_a_driven_servo_are_written_with_its_torque_off(
+    change: Callable[[DynamixelBackend], object],
+) -> None:
+    drive = driven()
+    assert record(drive).lock == CommandLock.LOCKED_BY_SENDER
+    change(drive.port)
+    assert not drive.is_on
+    drive.port.stop()
+    assert record(drive).lock == CommandLock.UNLOCKED
+
+
+def test_a_servo_that_another_program_has_switched_on_is_off_before_it_is_set() -> None:
+    drive = ready()
+    drive.servo.table[11], drive.servo.table[64] = 3, 1
+    drive.port.set_strategy(TORQUE_LOOP)
+    assert (drive.servo.table[11], drive.is_on, goal(drive)) == (0, True, 0)
+
+
+@pytest.mark.parametrize("lifetime", [0.02, 2.54])
+def test_the_shortest_and_the_longest_lifetime_are_set(lifetime: float) -> None:
+    drive = ready()
+    drive.servo.table[98] = 0xFF
+    assert drive.port.set_command_lifetime(lifetime) == pytest.approx(lifetime)
+    assert drive.servo.table[98] == round(lifetime / 0.02)
+
+
+def test_the_smallest_and_the_largest_limit_are_set() -> None:
+    drive, model = ready(), MODELS["XL330-M288"]
+    for effort, code in ((1.01 * model.step, 1), (model.peak, 1750)):
+        assert drive.port.set_limits(HardwareLimits(effort=effort)).effort == effort
+        assert abs(struct.unpack_from("<H", drive.servo.table, 38)[0] - code) <= 1
+
+
+@pytest.mark.parametrize(
+    ("fault", "sentence"),
+    [(ActuatorFault.COMMANDS_LOST, "reads torque enable 1"), (ActuatorFault.FEEDBACK_LOST, "is silent")],
+)
+def test_a_stop_that_is_not_confirmed_names_what_was_seen(fault: ActuatorFault, sentence: str) -> None:
+    drive = driven()
+    drive.faults.add(fault)
+    with pytest.raises(ActuatorError, match=f"servo 1 {sentence}; expected 0"):
+        drive.port.stop()
 
 
 def test_a_servo_that_does_not_switch_on_wholly_is_switched_off() -> None:
