@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pendulum_bags.arrays import Array
+from pendulum_bags.distributions import student_quantile
 from pendulum_bags.identification.arrowhead import robust_cost
 from pendulum_bags.identification.covariance import information
 from pendulum_bags.identification.cross_validation import COARSE, cross_validate, predicted
@@ -175,7 +176,11 @@ def _torques(
                 fit = _fit_friction("coulomb", chosen.solution, pieces, names, scale, (), options)
                 gains[words] = max(gains[words], 1.0 - fit.score / chosen.score)
                 # What is there shows in every part of the data; what is there by luck does not.
-                if fit.validation is not None and np.all(fit.validation.losses < chosen.validation.losses):
+                if (
+                    fit.validation is not None
+                    and np.all(fit.validation.losses < chosen.validation.losses)
+                    and _determined(fit.solution.model, fit.validation.vectors, TORQUES[words])
+                ):
                     fits.append(fit)
         better = choose([chosen, *fits], strict=True)
         if better is chosen:
@@ -183,6 +188,14 @@ def _torques(
         chosen = better
         own = tuple(name for name in chosen.free if name in JOINT_TORQUES)
     return (chosen.solution if own else best), own, gains
+
+
+def _determined(model: FitModel, vectors: Array, names: Sequence[str]) -> bool:
+    """Return whether fits without a fold, shape (f, parameters), agree that one of some amplitudes is not 0."""
+    index, count = model.index(names), len(vectors)
+    apart = vectors[:, index] - vectors[:, index].mean(axis=0)
+    error = np.sqrt((count - 1) / count * np.sum(apart**2, axis=0))
+    return bool(np.any(np.abs(model.vector[index]) > student_quantile(0.975, count - 1) * error))
 
 
 def _promised(candidate: Candidate, pieces: Sequence[Piece], scale: float) -> dict[str, float]:
