@@ -348,6 +348,17 @@ def test_connecting_finds_a_servo_that_is_driven_and_off_ends_its_torque() -> No
     assert (drive.is_on, goal(drive)) == (False, 0)
 
 
+def test_closing_ends_the_torque_that_another_program_left_and_releases_the_line() -> None:
+    drive = ready()
+    drive.servo.write(64, b"\1", drive.clock.now_ns())
+    line = loop_port(drive.line, drive.clock)
+    port = DynamixelBackend(1, lambda: line, drive.clock)
+    assert port.connect().feedback_rate == 100.0
+    assert (drive.is_on, line.is_open) == (True, True)
+    port.close()
+    assert (drive.is_on, line.is_open) == (False, False)
+
+
 def test_commands_expire_although_requests_go_on() -> None:
     drive = driven()
     port = drive.port
@@ -501,6 +512,7 @@ def test_a_stop_that_is_not_confirmed_leaves_the_line_silent_until_the_watchdog_
     drive.clock.wait_until(drive.clock.now_ns() + 2 * MILLISECOND)
     drive.advance()
     assert (goal(drive), drive.expiries) == (0, 1)
+    assert drive.port.read(0.02) is not None
 
 
 def test_a_line_that_fails_is_named_and_closing_still_releases_it() -> None:
