@@ -152,8 +152,17 @@ def test_files_that_are_none_are_named(clone):
     file.write_text("\n".join(",".join(row) for row in rows))
     with pytest.raises(DataError, match=r"trajectory\.csv lacks the columns tau_con2"):
         read_trials(clone)
-    (file.parent / "scores_v2.csv").write_text("Score\n")
-    with pytest.raises(DataError, match="no number under RealAI Score"):
+    for torque, rows in ((math.nan, "0 of 1001"), (1.0, "2 of 2")):
+        swing_up(file, torque=torque, end=0.01 if rows == "2 of 2" else 10.0)
+        with pytest.raises(DataError, match=rf"trajectory\.csv has {rows} rows finite; expected all, and at least 3"):
+            read_trials(clone)
+    for content in ("Score\n", "RealAI Score\nnan\n"):
+        (file.parent / "scores_v2.csv").write_text(content)
+        with pytest.raises(DataError, match="no finite number under RealAI Score"):
+            read_trials(clone)
+    publish(swing_up(file).with_name("scores_v2.csv"), 0.5)
+    file.parent.rename(file.parent.with_name("experiment01b"))
+    with pytest.raises(DataError, match="experiment01b has no number; expected a folder of a trial"):
         read_trials(clone)
 
 

@@ -10,6 +10,7 @@ leaderboards and github.com/dfki-ric-underactuated-lab/double_pendulum (1e8544e)
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -59,6 +60,7 @@ SIMULATED = {
 """What a simulation picks by, and the files that give it. Score v2 has other norms in simulation than on machines."""
 _SCORE, _NORMS, _ROBUSTNESS = SIMULATED
 _LEAST = 3
+"""Smallest number of controllers of a ranking, and of rows of a run."""
 _WHOLE = 0.99
 """Share of its planned length from which a run may be a success."""
 _ALIASES = {"MC-PILCO": "mcpilco", "ilqr_tvlqr": "ilqr_tvlqr_lqr"}
@@ -126,14 +128,18 @@ def trajectory_rows(trajectory: Path) -> Array:
     """Return a trajectory's rows of time, measured state and commanded torques, shape (N, 7).
 
     Raises:
-        DataError: The file lacks one of these columns.
+        DataError: The file lacks one of these columns, or has fewer than 3 rows of finite numbers.
     """
     table = read_delimited(trajectory)
     if missing := [name for name in _COLUMNS if name not in table.columns]:
         raise DataError(
             f"{trajectory} lacks the columns {', '.join(missing)}; expected a trajectory of the leaderboard"
         )
-    return np.stack([table.values(name) for name in _COLUMNS], axis=1)
+    rows = np.stack([table.values(name) for name in _COLUMNS], axis=1)
+    finite = int(np.isfinite(rows).all(axis=1).sum())
+    if not _LEAST <= finite == len(rows):
+        raise DataError(f"{trajectory} has {finite} of {len(rows)} rows finite; expected all, and at least {_LEAST}")
+    return rows
 
 
 def score_of(contest: Contest, robot: str, trajectory: Path) -> tuple[float, float]:
@@ -167,8 +173,10 @@ def read_trials(data: Path) -> list[Trial]:
                 of_rules, of_any = score_of(contest, robot, trajectory) if trajectory.is_file() else (None, published)
                 short = of_rules is not None and abs(of_rules - of_any) > TOLERANCE >= abs(of_any - published)
                 reason = f"up at its end before {contest.duration:g} s: published as a success, none by the rules"
-                number = int(file.parent.name.removeprefix("experiment"))
-                trials.append(Trial(contest, robot, _name(file, -3), number, published, of_rules, reason * short))
+                number = file.parent.name.removeprefix("experiment")
+                if not number.isdecimal():
+                    raise DataError(f"{file.parent} has no number; expected a folder of a trial, as experiment01")
+                trials.append(Trial(contest, robot, _name(file, -3), int(number), published, of_rules, reason * short))
     if not trials:
         raise DataError(
             f"{data} holds no scores as data/acrobot/real_system/CONTROLLER/experiment01/scores.csv; expected a clone "
@@ -184,9 +192,12 @@ def _name(file: Path, part: int) -> str:
 def published_score(file: Path) -> float:
     """Return the score that a file of the leaderboard states."""
     try:
-        return float(next(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))["RealAI Score"])
-    except (StopIteration, KeyError, TypeError, ValueError) as error:
-        raise DataError(f"{file} has no number under RealAI Score; expected the published score") from error
+        score = float(next(csv.DictReader(file.read_text(encoding="utf-8").splitlines()))["RealAI Score"])
+    except (StopIteration, KeyError, TypeError, ValueError):
+        score = math.nan
+    if not math.isfinite(score):
+        raise DataError(f"{file} has no finite number under RealAI Score; expected the published score")
+    return score
 
 
 def comparisons(data: Path, trials: Sequence[Trial]) -> list[Comparison]:
