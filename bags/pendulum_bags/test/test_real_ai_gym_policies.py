@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from pendulum_bags.commands.public_study_cli import main
-from pendulum_bags.studies.real_ai_gym import CONTESTS, read_trials, score_of
+from pendulum_bags.studies.real_ai_gym import CONTESTS, read_trials, score_of, trajectory_rows
 from pendulum_bags.studies.real_ai_gym_policies import (
     _BOARD_POLICIES,
     BOARD_PLANT,
@@ -95,7 +95,7 @@ def test_a_policy_is_compared_with_its_logs_and_a_plant_predicts_each_trial(clon
     assert prediction_jobs(data, policies, trials, [])[0]().difference == pytest.approx(0.1, rel=1e-6)
 
 
-def test_a_command_is_held_clipped_and_late_by_a_period_if_it_is_delayed():
+def test_the_machines_loop_acts_a_period_later_on_velocities_that_are_differences():
     plant = load_mechanism(BOARD_PLANT)
     asked = []
 
@@ -103,12 +103,14 @@ def test_a_command_is_held_clipped_and_late_by_a_period_if_it_is_delayed():
         asked.append(state)
         return np.array([10.0, 10.0])
 
-    on_time = closed_loop(plant, policy, PERIOD, (2.0, 0.0), delayed=False, duration=0.3)
+    on_time = closed_loop(plant, policy, PERIOD, (2.0, 0.0), as_machine=False, duration=0.3)
     assert on_time.shape == (10, 7)
     assert np.array_equal(on_time[:, 5:], np.tile([2.0, 0.0], (10, 1)))
-    late = closed_loop(plant, policy, PERIOD, (2.0, 0.0), delayed=True, duration=0.3)
+    late = closed_loop(plant, policy, PERIOD, (2.0, 0.0), as_machine=True, duration=0.3)
     assert not late[1, 1:5].any()
-    assert np.allclose(late[2:, 1:5], on_time[1:-1, 1:5], rtol=1e-12)
+    assert np.allclose(late[2:, 1:3], on_time[1:-1, 1:3], rtol=1e-12)
+    assert np.allclose(late[1:, 3:5], np.diff(late[:, 1:3], axis=0) / PERIOD, rtol=1e-12)
+    assert np.array_equal(np.array(asked[-10:]), late[:, 1:5])
     # Of rest, the first period's torque gives the shoulder the speed of its own inertia, M^-1 (2, 0) 30 ms.
     inertia, mass, length = plant.value("inertia_1"), plant.value("mass_2"), plant.value("length_1")
     i2, c2 = plant.value("inertia_2"), plant.value("centre_2")
@@ -121,7 +123,7 @@ def test_a_command_is_held_clipped_and_late_by_a_period_if_it_is_delayed():
         lambda _: np.zeros(2),
         PERIOD,
         (2.0, 0.0),
-        delayed=False,
+        as_machine=False,
         pushes=np.array([[0.0, 0.0]] * 15 + [[2.0, 0.0]]),
         duration=0.3,
     )
@@ -253,3 +255,23 @@ def test_the_published_controllers_score_as_published(shared_data):
     predicted = {one.robot: one for one in predictions}
     assert all(one.difference < 1e-9 for one in predicted.values())
     assert np.mean(predicted["pendubot"].predicted[False, False]) == pytest.approx(0.6, abs=0.1)
+    for trajectory in (data / "data").glob("*/real_system*/*/*/trajectory.csv"):
+        rows = trajectory_rows(trajectory)
+        differences = np.diff(rows[:, 1:3], axis=0) / np.diff(rows[:, 0])[:, None]
+        assert np.array_equal(rows[1:, 3:5], differences), trajectory
+
+
+@pytest.mark.parametrize(
+    ("plants", "why"),
+    [
+        (["thesis"], "--plant thesis is a pendulum, driven at pendulum_joint; expected a double_pendulum"),
+        (["acrobot"], "--plant acrobot is a double_pendulum, driven at elbow; expected"),
+        (["double_pendulum"] * 2, "double_pendulum, double_pendulum; expected files of different names"),
+        ([BOARD_PLANT], f"none {BOARD_PLANT}"),
+    ],
+)
+def test_plants_that_cannot_be_compared_are_refused_before_any_run(clones, capsys, plants, why):
+    data, policies = clones
+    options = [option for plant in plants for option in ("--plant", plant)]
+    assert main(["real_ai_gym", "--data", str(data), "--policies", str(policies), *options]) == 2
+    assert why in capsys.readouterr().err

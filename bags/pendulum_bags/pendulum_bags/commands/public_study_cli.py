@@ -49,12 +49,13 @@ def real_ai_gym(
     """
     from pendulum_bags.studies.real_ai_gym import comparisons, read_trials
     from pendulum_bags.studies.real_ai_gym_page import Study, study_tables, study_text, to_json, write_study
-    from pendulum_bags.studies.real_ai_gym_policies import board_jobs, prediction_jobs
+    from pendulum_bags.studies.real_ai_gym_policies import board_jobs, prediction_jobs, refuse_other_plants
 
     if plant and policies is None:
         raise ParameterError(
             f"--plant is {plant[0]} without --policies; expected both: the plant runs these controllers"
         )
+    refuse_other_plants(plant or [])
     trials = read_trials(data)
     console = make_console(highlight=False)
     study = Study(trials, comparisons(data, trials))

@@ -136,7 +136,7 @@ def _policy_tables(study: Study) -> list[Table]:
         Table(
             "Controllers of the simulation's board, simulated again",
             "Published score v2, that of a run here in the contests' plant, and in each further plant the score by "
-            "the machine's norms, without perturbations and delay.",
+            "the machine's norms, without perturbations and the machine's loop.",
             ("controller", "published", "here", *(f"in {plant}" for plant in elsewhere)),
             board,
         ),
@@ -144,8 +144,9 @@ def _policy_tables(study: Study) -> list[Table]:
             "What a plant predicts of MC-PILCO on the machine",
             "Its published file gives the torques that its trials logged, up to the rms difference shown. Mean score "
             "of the trials, and of as many simulated ones with the same perturbations: with the plant's friction and "
-            "the control period (30 ms) by which the machine acted later, or without one or both.",
-            ("robot, plant", "difference [N m]", "machine", "friction and delay", "friction", "delay", "neither"),
+            "the machine's loop (commands act a control period of 30 ms later, velocities are differences of positions "
+            "over one), or without one or both.",
+            ("robot, plant", "difference [N m]", "machine", "friction and loop", "friction", "loop", "neither"),
             predictions,
         ),
     ]
@@ -197,7 +198,7 @@ def to_json(study: Study) -> dict[str, Any]:
     predictions = [
         {
             **one._asdict(),
-            "predicted": [{"friction": f, "delay": d, "scores": v} for (f, d), v in one.predicted.items()],
+            "predicted": [{"friction": f, "loop": p, "scores": v} for (f, p), v in one.predicted.items()],
         }
         for one in study.predictions
     ]

@@ -23,7 +23,7 @@ from pendulum_bags.recordings.delimited import read_delimited
 from pendulum_bags.studies.real_ai_gym import CONTESTS, Trial, published_score, score_of_rows, trajectory_rows
 from pendulum_lqr.policies.bounded_files import read_bounded
 from pendulum_lqr.policies.torch_state import read_state
-from pendulum_msgs_py.errors import DataError
+from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
 from pendulum_sim.stepping.plants import make_plant
 
@@ -36,6 +36,7 @@ __all__ = [
     "board_jobs",
     "closed_loop",
     "prediction_jobs",
+    "refuse_other_plants",
 ]
 
 BOARD_TOLERANCE = 0.02
@@ -71,7 +72,7 @@ class PredictionRow(NamedTuple):
     Attributes:
         difference: Rms difference of its torques at the logged states from the logged ones [N m].
         machine: Scores of the trials.
-        predicted: Scores under the perturbations of the same trials, by (friction, delay of a control period).
+        predicted: Scores under the perturbations of the same trials, by (friction, the machine's loop).
     """
 
     robot: str
@@ -81,13 +82,33 @@ class PredictionRow(NamedTuple):
     predicted: dict[tuple[bool, bool], tuple[float, ...]]
 
 
+def refuse_other_plants(plants: Sequence[str]) -> None:
+    """Refuse files or presets that are no double pendulum with torques at both joints, or have one name.
+
+    Raises:
+        ParameterError: They are.
+    """
+    for plant in plants:
+        found = load_mechanism(plant)
+        model, driven = found.mechanism.model, found.coordinates.driven_names
+        if model != "double_pendulum" or len(driven) < len(found.joints) or found.coordinates.volts:
+            volts = " in volts" if found.coordinates.volts else ""
+            raise ParameterError(
+                f"--plant {plant} is a {model}, driven{volts} at {', '.join(driven) or 'no joint'}; expected a "
+                "double_pendulum with torques at both joints"
+            )
+    if len(names := {Path(plant).stem for plant in plants}) < len(plants) or BOARD_PLANT in names:
+        raise ParameterError(f"--plant is {', '.join(plants)}; expected files of different names, none {BOARD_PLANT}")
+
+
 def board_jobs(data: Path, policies: Path, plants: Sequence[str]) -> list[Callable[[], BoardRow]]:
     """Return jobs, a row each: controllers of the simulation's second board that are published as arrays.
 
     Args:
         data: Clone of real_ai_gym_leaderboard.
         policies: Clone of double_pendulum.
-        plants: Files or presets of further plants; there by the machine's norms, without perturbations and delay.
+        plants: Files or presets of further plants; there by the machine's norms, without perturbations
+            and the machine's loop.
     """
     return [partial(_board_row, data, policies, robot, name, plants) for robot in _MACHINE for name in _BOARD_POLICIES]
 
@@ -114,7 +135,7 @@ def _board_row(data: Path, policies: Path, robot: str, name: str, plants: Sequen
     files = sorted(folder.glob("scores*.csv"))
     if not files:
         raise DataError(f"{folder} has no scores*.csv; expected the published score of the simulation's board")
-    runs = (closed_loop(load_mechanism(of), policy, _STEP, limits, delayed=False) for of in (BOARD_PLANT, *plants))
+    runs = (closed_loop(load_mechanism(of), policy, _STEP, limits, as_machine=False) for of in (BOARD_PLANT, *plants))
     own, *others = runs
     computed = score_of_rows(_BOARD, robot, own, simulated=True)[0]
     elsewhere = {Path(of).stem: _score(robot, run) for of, run in zip(plants, others, strict=True)}
@@ -133,9 +154,9 @@ def _prediction_row(data: Path, policies: Path, robot: str, trials: Sequence[Tri
     predicted = {}
     for friction in (True, False) if _has_friction(true) else (False,):
         there = true if friction else _without_friction(true)
-        for delayed in (True, False):
-            predicted[friction, delayed] = tuple(
-                _score(robot, closed_loop(there, policy, period, limits, delayed=delayed, pushes=each))
+        for as_machine in (True, False):
+            predicted[friction, as_machine] = tuple(
+                _score(robot, closed_loop(there, policy, period, limits, as_machine=as_machine, pushes=each))
                 for each in pushes
             )
     difference = float(np.sqrt(np.mean(differences**2)))
@@ -148,29 +169,33 @@ def closed_loop(
     period: float,
     limits: tuple[float, float],
     *,
-    delayed: bool,
+    as_machine: bool,
     pushes: Array | None = None,
     duration: float = _BOARD.duration,
 ) -> Array:
-    """Return rows of time, state and commanded torques of a run from hanging at rest, one for each control period.
+    """Return rows of time, measured state and commands of a run from hanging at rest, one for each control period.
 
     Args:
         plant: A double pendulum with both joints driven.
         period: Control period, over which a command is held [s].
         limits: Of the torque of both joints [N m].
-        delayed: A command acts from the next control period on.
+        as_machine: The loop of the machine: a command acts from the next control period on, and velocities are the
+            change of position over the last one, as those of all logs are. Else at once, with the plant's velocities.
         pushes: Torques on both joints by steps of 2 ms, shape (N, 2) [N m]; the last stays. None for none.
     """
     inner = max(1, math.ceil(period / _STEP - 1e-9))
     stepped = make_plant(plant, period / inner)
     stepped.reset((0.0, 0.0), (0.0, 0.0))
     acting = (0.0, 0.0)
-    rows = []
+    rows: list[tuple[float, ...]] = []
     for k in range(math.ceil(duration / period - 1e-9)):
-        state = np.array((*stepped.state.position, *stepped.state.velocity))
+        position, velocity = np.array(stepped.state.position), np.array(stepped.state.velocity)
+        if as_machine:
+            velocity = (position - rows[-1][1:3]) / period if rows else np.zeros(2)
+        state = np.concatenate([position, velocity])
         command = np.clip(policy(state), np.negative(limits), limits)
         rows.append((k * period, *state, *command))
-        now, acting = (acting if delayed else tuple(command)), tuple(command)
+        now, acting = (acting if as_machine else tuple(command)), tuple(command)
         for i in range(inner):
             at = round((k + i / inner) * period / _STEP)
             push = (0.0, 0.0) if pushes is None else tuple(pushes[min(at, len(pushes) - 1)])
