@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import struct
 import threading
 from collections.abc import Callable, Iterator
@@ -255,6 +256,20 @@ def test_replies_that_stay_some_requests_behind_are_no_feedback(behind: int) -> 
     assert [drive.port.read(0.02) for _ in range(12)] == [None] * 12
 
 
+@pytest.mark.parametrize(
+    ("rate", "late"),
+    [(100.0, 0.034), (100.0, 0.041), (250.0, 0.0165), (500.0, 0.0085), (500.0, 0.0165), (500.0, 0.0305)],
+)
+def test_replies_that_stay_late_are_no_feedback_at_any_rate(rate: float, late: float) -> None:
+    drive = ready()
+    drive.port.set_feedback_rate(rate)
+    drive.line.tamper = lambda due_ns, packet: [(due_ns + round(late * 1e9), packet)]
+    assert [drive.port.read(0.02) for _ in range(60)] == [None] * 60
+    drive.line.tamper = lambda due_ns, packet: [(due_ns, packet)]
+    drive.clock.wait_until(drive.clock.now_ns() + 100 * MILLISECOND)
+    assert drive.port.read(0.02) is not None
+
+
 def test_damaged_foreign_and_short_packets_are_no_feedback_and_the_next_good_one_is() -> None:
     drive = ready()
     spoiled: list[Callable[[bytes], bytes]] = [
@@ -450,6 +465,24 @@ def test_the_watchdog_ends_torque_of_a_dead_computer_and_its_error_is_named_and_
     assert (goal(drive) > 0, drive.servo.table[98]) == (True, 2)
 
 
+def test_a_goal_that_a_watchdog_holds_back_gives_no_torque_when_it_is_cleared() -> None:
+    drive = driven()
+    # Not known of a real servo: the goal may outlast the watchdog's action, and not be writable until that is cleared.
+    drive.servo.table[98] = 0xFF
+    drive.port.stop()
+    assert goal(drive) > 0
+    given: list[int] = []
+    original = drive.servo._apply
+
+    def apply(now_ns: int) -> None:
+        given.append(goal(drive) if drive.servo.torque_on else 0)
+        original(now_ns)
+
+    drive.servo._apply = apply  # type: ignore[method-assign]
+    drive.port.set_strategy(TORQUE_LOOP)
+    assert (drive.is_on, any(given)) == (True, False)
+
+
 def test_a_restart_is_named_by_the_watchdog_that_it_lost() -> None:
     drive = driven()
     drive.restart()
@@ -474,6 +507,15 @@ def test_an_alert_is_an_error_with_its_cause_while_driving_and_refuses_to_arm_ag
     ):
         with pytest.raises(ActuatorError, match="overheating"):
             call()
+
+
+def test_an_alert_whose_cause_does_not_come_is_an_error_all_the_same() -> None:
+    drive = driven()
+    drive.fail()
+    drive.line.tamper = lambda due_ns, packet: [(due_ns, packet)] if len(packet) > 20 else []
+    with pytest.raises(ActuatorError, match=r"replies with error 0x80, then is silent; expected none") as caught:
+        drive.port.read(0.02)
+    assert caught.value.fault == "drive_error"
 
 
 def test_a_silent_servo_is_named_with_its_line() -> None:
@@ -607,10 +649,9 @@ def test_flash_memory_is_written_only_when_a_setting_differs() -> None:
 # --- several servos, and a real line --------------------------------------------------------------------------
 
 
-def test_two_servos_share_a_line_and_a_stop_of_one_leaves_the_other() -> None:
+def two_driven() -> tuple[SteppedServo, EmulatedServo, DynamixelBackend, DynamixelBackend]:
     drive = SteppedServo("double_pendulum", position=(0.0, 0.0))
-    second = EmulatedServo(drive.machine, 1, number=2)
-    drive.line.servos[2] = second
+    second = drive.line.servos[2] = EmulatedServo(drive.machine, 1, number=2)
     shared = loop_port(drive.line, drive.clock)
     first = DynamixelBackend(1, lambda: shared, drive.clock)
     other = first.on_this_bus({"drive_id": 2, "drive_model": "XL330-M288"})
@@ -620,12 +661,31 @@ def test_two_servos_share_a_line_and_a_stop_of_one_leaves_the_other() -> None:
         port.set_limits(HardwareLimits(effort=0.4))
         port.set_strategy(TORQUE_LOOP, Command(effort=0.1))
     assert goal(drive) > 0
+    return drive, second, first, other
+
+
+def test_two_servos_share_a_line_and_a_stop_of_one_leaves_the_other() -> None:
+    drive, second, first, other = two_driven()
     drive.servo.faults.add(ActuatorFault.FEEDBACK_LOST)
     assert first.read(0.02) is None
     # After one silent servo the SDK's group read gives 0 for all: each is asked alone.
     assert other.read(0.02) is not None
     other.stop()
     assert (drive.servo.torque_on, second.torque_on) == (True, False)
+
+
+@pytest.mark.parametrize("silent", [0, 1])
+def test_torque_of_a_servo_does_not_wait_for_the_stop_of_a_silent_one(silent: int) -> None:
+    drive, second, *ports = two_driven()
+    servos = (drive.servo, second)
+    servos[silent].faults.add(ActuatorFault.FEEDBACK_LOST)
+    goals: list[int] = []
+    drive.clock.watch = lambda: goals.append(struct.unpack_from("<h", servos[1 - silent].table, 102)[0])
+    with pytest.raises(ActuatorError, match="asked 3 times"):
+        ports[silent].stop()
+    # Of three times 15 ms, the first.
+    assert sum(each != 0 for each in goals) <= 17
+    assert goals[-1] == 0
 
 
 @pytest.fixture
@@ -672,6 +732,18 @@ def test_the_vendors_library_reads_and_drives_a_servo_on_a_real_terminal(
         DynamixelBackend(1, lambda: serial_port(path, 1_000_000), WallClock()).connect()
     port.close()
     assert not servo.torque_on
+
+
+def test_an_adapter_that_is_pulled_is_an_error_of_the_line() -> None:
+    master, slave = os.openpty()
+    port = serial_port(os.ttyname(slave), 1_000_000)
+    assert port.openPort()
+    os.close(slave)
+    os.close(master)
+    # Discarding what came before a request is the first call that fails, with an error that is no OSError of itself.
+    with pytest.raises(OSError, match="Input/output error"):
+        port.clearPort()
+    port.closePort()
 
 
 def test_a_serial_device_that_is_not_there_is_refused_in_a_sentence(tmp_path: Path) -> None:

@@ -67,8 +67,8 @@ _SAFE = (
     (RETURN_DELAY, 0, "return delay"),
 )
 """Settings that must hold: current mode, no torque by a goal or by power alone, the manual's sign, prompt replies."""
-_SPANS = ((98, 48), (98, 49), (100, 46), (100, 47))
-"""Address and length of consecutive requests: no two of a round are of one length."""
+_SPANS = tuple((98 - more, 49 + more) for more in range(15))
+"""Address and length of consecutive requests, watchdog to temperature: no two of a round are of one length."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,8 @@ def serial_port(path: str, rate: int) -> Any:
         ActuatorError: dynamixel-sdk is not installed.
     """
     sdk = _sdk()
+    import termios
+
     import serial
 
     class Port(sdk.PortHandler):  # type: ignore[name-defined]  # the SDK has no types
@@ -115,6 +117,13 @@ def serial_port(path: str, rate: int) -> Any:
             self.is_open = True
             self.tx_time_per_byte = 1e4 / cflag_baud
             return True
+
+        def clearPort(self) -> None:  # noqa: N802
+            try:
+                self.ser.reset_input_buffer()
+            except termios.error as error:
+                # Of an adapter that was pulled; it is no OSError.
+                raise OSError(*error.args) from error
 
         def getCurrentTime(self) -> float:  # noqa: N802
             return time.monotonic() * 1e3
@@ -164,10 +173,9 @@ class DynamixelBackend(TorqueDrive):
         self._port: Any = None
         self._packets: Any = None
         self._watchdog = round(self._lifetime / WATCHDOG_STEP)
-        self._largest = self._turn = 0
+        self._largest = self._turn = self._silent = 0
         self._ticks: int | None = None
         self._tick_ns = self._counted = 0
-        self._celsius = math.nan
 
     @classmethod
     def from_parameters(cls, values: Mapping[str, Any], clock: Clock, **_: Any) -> DynamixelBackend:
@@ -214,7 +222,7 @@ class DynamixelBackend(TorqueDrive):
     def on_this_bus(self, values: Mapping[str, Any]) -> DynamixelBackend:
         """Return the port of another servo on the same line."""
         other = DynamixelBackend(int(values["drive_id"]), self._make_port, self.clock, model=values["drive_model"])
-        other._quiet = self._quiet
+        self._share_bus(other)
         return other
 
     # --- packets ----------------------------------------------------------------------------------------------
@@ -321,22 +329,30 @@ class DynamixelBackend(TorqueDrive):
         address, size = _SPANS[self._turn]
         self._turn = (self._turn + 1) % len(_SPANS)
         reply = self._ask(address, size, patience)
-        if reply is None:
-            return None
-        data, error = reply
         now = self.now_ns()
+        if reply is None:
+            self._silent += 1
+            if self._silent % len(_SPANS) == 0:
+                # The next round has the same lengths: let late replies come first, and be discarded.
+                self._bus.quiet_until_ns = now + round(_PATIENCE * NANOSECONDS)
+            return None
+        self._silent = 0
+        data, error = reply
         if self._possibly_on and error:
             reply = self._ask(HARDWARE_ERROR.address, HARDWARE_ERROR.size, patience)
-            self._refuse_error(reply[0][0] if reply else 0, f"replies with error 0x{error:02x}")
+            if reply is None:
+                raise ActuatorError(
+                    "drive_error", f"servo {self._id} replies with error 0x{error:02x}, then is silent; expected none"
+                )
+            self._refuse_error(reply[0][0], f"replies with error 0x{error:02x}")
 
         def value(register: Register) -> int:
             start = register.address - address
             return int.from_bytes(data[start : start + register.size], "little", signed=register.signed)
 
-        if address <= WATCHDOG.address and self._strategy is not self._strategy.OFF:
+        if self._strategy is not self._strategy.OFF:
             self._refuse_watchdog(value(WATCHDOG))
-        if address + size > TEMPERATURE.address:
-            self._celsius = float(value(TEMPERATURE))
+        celsius = float(value(TEMPERATURE))
         model, current = self._model, value(PRESENT_CURRENT) * self._model.current_step
         goal, duty = value(GOAL_CURRENT) * model.step, value(PRESENT_PWM) * _PWM_STEP
         position, velocity = (value(PRESENT_POSITION) - _CENTRE) * _POSITION_STEP, value(PRESENT_VELOCITY)
@@ -359,9 +375,9 @@ class DynamixelBackend(TorqueDrive):
             deflection=math.nan,
             deflection_velocity=math.nan,
             voltage=value(VOLTAGE) * 0.1,
-            winding_temperature=self._celsius,
-            housing_temperature=self._celsius,
-            motor_sensor_temperature=self._celsius,
+            winding_temperature=celsius,
+            housing_temperature=celsius,
+            motor_sensor_temperature=celsius,
             board_temperature=math.nan,
             processor_temperature=math.nan,
             lock=CommandLock.LOCKED_BY_SENDER if self._possibly_on else CommandLock.UNLOCKED,
@@ -406,9 +422,9 @@ class DynamixelBackend(TorqueDrive):
         self._set(TORQUE_ENABLE, 0, "torque enable")
         for register, wanted, what in _SAFE:
             self._set(register, wanted, what)
-        self._set(GOAL_CURRENT, 0, "goal current")
-        # 0 first: a watchdog that has acted refuses goals until then.
+        # A watchdog that has acted refuses every goal, also 0, until then.
         self._set(WATCHDOG, 0, "Bus Watchdog")
+        self._set(GOAL_CURRENT, 0, "goal current")
         self._set(WATCHDOG, self._watchdog, "Bus Watchdog")
         self._set(TORQUE_ENABLE, 1, "torque enable")
         self._send(effort)

@@ -6,6 +6,7 @@ the expiry of commands on this side, because the watchdog of most drives counts 
 
 from __future__ import annotations
 
+import contextlib
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -69,10 +70,12 @@ class Identity:
     firmware: str
 
 
-class Quiet:
-    """Time until which nothing is asked on a bus, so that the watchdogs of its drives can act [ns]."""
+class Bus:
+    """Drives on one bus, and the time until which nothing is asked on it, so that watchdogs can act [ns]."""
 
-    until_ns = 0
+    def __init__(self) -> None:
+        self.quiet_until_ns = 0
+        self.drives: list[TorqueDrive] = []
 
 
 class TorqueDrive(ABC):
@@ -98,7 +101,8 @@ class TorqueDrive(ABC):
         self._lifetime = 0.1
         self._period_ns = round(NANOSECONDS / 100.0)
         self._next_ns = 0
-        self._quiet = Quiet()
+        self._bus = Bus()
+        self._bus.drives.append(self)
         self._written_ns = self._sequence = 0
 
     @classmethod
@@ -182,7 +186,7 @@ class TorqueDrive(ABC):
         """Ask for the next record when it is due; None if it is not due within ``timeout`` [s], or is not answered."""
         self._require_connection()
         deadline = self.now_ns() + round(timeout * NANOSECONDS)
-        due = max(self._next_ns, self._quiet.until_ns)
+        due = max(self._next_ns, self._bus.quiet_until_ns)
         if due > deadline:
             self.clock.wait_until(deadline)
             return None
@@ -278,16 +282,28 @@ class TorqueDrive(ABC):
                 self._switch_off()
             except ActuatorError as error:
                 problem = error
+                self._calm_others()
             else:
                 self._possibly_on = False
                 return
         # Whatever reaches the drive feeds its watchdog: only silence lets it act.
-        self._quiet.until_ns = self.now_ns() + round(_SILENCE * self._lifetime * NANOSECONDS)
+        self._bus.quiet_until_ns = self.now_ns() + round(_SILENCE * self._lifetime * NANOSECONDS)
         raise ActuatorError(
             "stop_unacknowledged",
             f"drive did not confirm that it is off, asked {STOP_ATTEMPTS} times ({problem}); its watchdog ends its "
             "torque. Switch its supply off",
         )
+
+    def _calm_others(self) -> None:
+        """Send no torque to the other drives on the bus: theirs must not go on while this one is waited for."""
+        for other in self._bus.drives:
+            if other is not self and other._strategy is TORQUE_LOOP:
+                with contextlib.suppress(ActuatorError):
+                    other._send(0.0)
+
+    def _share_bus(self, other: TorqueDrive) -> None:
+        other._bus = self._bus
+        self._bus.drives.append(other)
 
     def _checked(self, command: Command, strategy: Strategy) -> tuple[float, bool]:
         limited, changed = check_command(command, strategy, self._limits)
