@@ -41,7 +41,7 @@ def results_at_once(
     Raises:
         typer.Exit: The user interrupted; no results are left.
     """
-    pool = ProcessPoolExecutor(min(len(jobs), workers or os.cpu_count() or 1))
+    pool = ProcessPoolExecutor(max(1, min(len(jobs), workers or os.cpu_count() or 1)))
     results = []
     try:
         with counting_bar(console) as bar:
@@ -53,6 +53,10 @@ def results_at_once(
         pool.shutdown(wait=False, cancel_futures=True)
         console.print("interrupted: nothing was written")
         raise typer.Exit(EXIT_INTERRUPTED) from None
+    except BaseException:
+        # A pool that is left to the end of the program writes a traceback of its own now and then.
+        pool.shutdown(cancel_futures=True)
+        raise
     pool.shutdown()
     return results
 
