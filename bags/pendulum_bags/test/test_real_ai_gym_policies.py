@@ -275,3 +275,12 @@ def test_plants_that_cannot_be_compared_are_refused_before_any_run(clones, capsy
     options = [option for plant in plants for option in ("--plant", plant)]
     assert main(["real_ai_gym", "--data", str(data), "--policies", str(policies), *options]) == 2
     assert why in capsys.readouterr().err
+
+
+def test_a_file_in_place_of_the_out_folder_is_refused_before_any_run(clones, capsys, tmp_path):
+    data, policies = clones
+    (tmp_path / "out").write_text("")
+    options = ["--data", str(data), "--policies", str(policies), "--out", str(tmp_path / "out")]
+    # (the runs would ask for the board's controllers, which these clones lack)
+    assert main(["real_ai_gym", *options]) == 2
+    assert f"{tmp_path / 'out'} cannot be" in capsys.readouterr().err

@@ -57,6 +57,8 @@ def real_ai_gym(
         )
     refuse_other_plants(plant or [])
     trials = read_trials(data)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)  # what is no folder is refused before the runs
     console = make_console(highlight=False)
     study = Study(trials, comparisons(data, trials))
     if policies is not None:
