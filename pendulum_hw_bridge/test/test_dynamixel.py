@@ -610,6 +610,11 @@ def test_a_scan_names_models_that_are_known_and_others_by_their_number(monkeypat
     line.openPort = missing
     with pytest.raises(ActuatorError, match="serial line failed: no such device"):
         DynamixelBackend.scan({"interface": "loop", "bus_rate": 1_000_000})
+    line.openPort = lambda: False
+    with pytest.raises(ActuatorError, match="serial device loop refuses 1000000 baud"):
+        DynamixelBackend.scan({"interface": "loop", "bus_rate": 1_000_000})
+    with pytest.raises(ParameterError, match="interface is empty; expected the serial device"):
+        DynamixelBackend.scan({"interface": "", "bus_rate": 1_000_000})
 
 
 def test_a_header_inside_a_packet_is_stuffed_and_taken_out_again() -> None:

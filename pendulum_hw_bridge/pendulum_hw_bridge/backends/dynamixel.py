@@ -149,6 +149,17 @@ def _sdk() -> Any:
     return dynamixel_sdk
 
 
+def _device(values: Mapping[str, Any]) -> str:
+    if not values["interface"]:
+        raise ParameterError("interface is empty; expected the serial device of the servos, such as /dev/ttyUSB0")
+    return str(values["interface"])
+
+
+def _open_line(port: Any) -> None:
+    if not port.is_open and not port.openPort():
+        raise ActuatorError("module_lost", f"serial device {port.port_name} refuses {port.baudrate} baud")
+
+
 class DynamixelBackend(TorqueDrive):
     """Actuator port of one servo.
 
@@ -180,9 +191,7 @@ class DynamixelBackend(TorqueDrive):
     @classmethod
     def from_parameters(cls, values: Mapping[str, Any], clock: Clock, **_: Any) -> DynamixelBackend:
         """Return the port of the servo that the bridge's parameters name."""
-        path = values["interface"]
-        if not path:
-            raise ParameterError("interface is empty; expected the serial device of the servos, such as /dev/ttyUSB0")
+        path = _device(values)
         ports: list[Any] = []
 
         def shared() -> Any:
@@ -202,14 +211,13 @@ class DynamixelBackend(TorqueDrive):
     @classmethod
     def scan(cls, values: Mapping[str, Any]) -> list[Identity]:
         """Return the servos that reply to a broadcast."""
-        port = serial_port(values["interface"], values["bus_rate"])
+        port = serial_port(_device(values), values["bus_rate"])
         try:
-            port.openPort()
+            _open_line(port)
             found, _ = _sdk().PacketHandler(2.0).broadcastPing(port)
+            port.closePort()
         except (OSError, ValueError) as error:
             raise ActuatorError("module_lost", f"serial line failed: {error}") from error
-        with contextlib.suppress(OSError, AttributeError):
-            port.closePort()
         names = {model.number: model for model in MODELS.values()}
         unknown = ServoModel("unknown", math.nan, 1.0, math.nan, 0, math.nan)
         return [
@@ -232,8 +240,7 @@ class DynamixelBackend(TorqueDrive):
             port = self._make_port()
             self._packets = _sdk().PacketHandler(2.0)
             with self._line("module_lost"):
-                if not port.is_open and not port.openPort():
-                    raise ActuatorError("module_lost", f"serial device {port.port_name} refuses {port.baudrate} baud")
+                _open_line(port)
             self._port = port
         number = self._get(MODEL)
         if number != self._model.number:
@@ -405,7 +412,8 @@ class DynamixelBackend(TorqueDrive):
             )
         raise ActuatorError(
             "module_restarted",
-            f"Bus Watchdog of servo {self._id} reads {reads}; expected {self._watchdog}: it has lost its settings",
+            f"Bus Watchdog of servo {self._id} reads {reads}; expected {self._watchdog}, as set: has the servo lost "
+            "power, or has another program written to it?",
         )
 
     def _code(self, effort: float) -> int:

@@ -290,8 +290,8 @@ class TorqueDrive(ABC):
         self._bus.quiet_until_ns = self.now_ns() + round(_SILENCE * self._lifetime * NANOSECONDS)
         raise ActuatorError(
             "stop_unacknowledged",
-            f"drive did not confirm that it is off, asked {STOP_ATTEMPTS} times ({problem}); its watchdog ends its "
-            "torque. Switch its supply off",
+            f"drive did not confirm that it is off, asked {STOP_ATTEMPTS} times ({problem}): unless its "
+            "watchdog acts, it may have torque. Switch its supply off",
         )
 
     def _calm_others(self) -> None:
