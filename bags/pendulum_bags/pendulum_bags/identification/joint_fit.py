@@ -65,8 +65,11 @@ _NEAR = 5
 _BEFORE = 0.02
 """Longest delay after which an effort from before the recording may still act [s]."""
 
-_DIFFERENCE = 1e-4
-"""Step of the differences, in the size of a parameter, and in rad, m, rad/s or m/s of a start."""
+_DIFFERENCE = 1e-5
+"""Step of the differences, in the size of a parameter, and in rad, m, rad/s or m/s of a start.
+
+Larger ones have errors that look like effects: where dry friction sticks, 1e-4 tells numbers apart that do the same.
+"""
 
 _AWAY = "the starting plant's motion leaves all bounds within a window; expected a plant that is near"
 
