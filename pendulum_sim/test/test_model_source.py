@@ -12,7 +12,7 @@ from pendulum_msgs_py.errors import ParameterError
 
 mujoco = pytest.importorskip("mujoco")
 
-from pendulum_sim.foreign.model_source import ModelSource  # noqa: E402
+from pendulum_sim.foreign.model_source import WRITTEN, ModelSource  # noqa: E402
 
 MJCF = """<?xml version="1.0"?>
 <!-- a robot > of the lab -->
@@ -53,7 +53,7 @@ def changed(path: Path, out: Path, values: dict[str, float]) -> tuple[list[str],
     """Write a file with other numbers; return the lines that differ, and what it is then."""
     source = ModelSource(path)
     parameters = [source.parameter(name) for name in values]
-    source.write(out, parameters, list(values.values()), ["made by a test -- see there", "second line"])
+    source.write(out, parameters, list(values.values()), [f"{WRITTEN} by a test -- see there", "second line"])
     lines = difflib.ndiff(path.read_text().splitlines(), out.read_text().splitlines())
     return [line for line in lines if line[0] in "+-"], ModelSource(out)
 
@@ -68,7 +68,7 @@ def test_only_the_characters_of_the_numbers_change(robot: Path) -> None:
     lines, again = changed(robot, robot.with_name("new.xml"), values)
 
     assert lines == [
-        "+ <!-- made by a test - - see there",
+        "+ <!-- Identified by output error by a test - - see there",
         "+      second line -->",
         '-       <joint axis="0 1 0" name="arm"   frictionloss = \'0.10\' class="geared"/>',
         '+       <joint axis="0 1 0" name="arm"   frictionloss = \'0.125\' class="geared"/>',
@@ -138,9 +138,10 @@ def test_urdf_has_its_own_elements(tmp_path: Path) -> None:
     ("name", "said"),
     [
         ("damping", "expected KIND/NAME/ATTRIBUTE"),
-        ("joint/elbow/damping", r"has no joint 'elbow'; expected one of: arm, wrist"),
+        ("joint/elbow/damping", r"states no joint 'elbow'; expected one of: arm, wrist"),
+        ("joint/wrist/dampin", "expected one of these: armature, axis, damping, frictionloss, stiffness"),
         ("body/link/volume", "expected mass, inertia or ipos"),
-        ("geom/ball/density", "does not state density; expected one of these: mass, name, pos, size, type"),
+        ("geom/ball/density", "does not state density; expected one of these: mass, pos, size, type"),
         ("geom/ball/size/3", "size has 1 numbers"),
         ("geom/ball/type", "type is 'sphere'"),
     ],
@@ -160,3 +161,31 @@ def test_the_file_itself_and_a_folder_without_its_parts_are_refused(robot: Path,
         with pytest.raises(ParameterError, match=said):
             source.write(out, [source.parameter("body/link/mass")], [1.0], ["x"])
     assert robot.read_text() == MJCF
+
+
+def test_only_a_file_that_was_written_here_is_overwritten_and_its_line_ends_stay(robot: Path) -> None:
+    robot.write_bytes(MJCF.replace("\n", "\r\n").encode())
+    _, first = changed(robot, robot.with_name("new.xml"), {"body/link/mass": 0.7})
+    _, again = changed(robot, first.path, {"body/link/mass": 0.8})
+    assert again.parameter("body/link/mass").value == 0.8
+    text = first.path.read_bytes()
+    assert text.count(b"\n") == text.count(b"\r\n")
+    mine = robot.with_name("mine.xml")
+    mine.write_text("<mujoco/>")
+    for out, said in ((mine, "has not written"), (robot, "the model itself"), (robot.with_name("new.urdf"), "ends in")):
+        with pytest.raises(ParameterError, match=said):
+            changed(robot, out, {"body/link/mass": 0.7})
+    assert mine.read_text() == "<mujoco/>"
+
+
+def test_joints_in_frames_are_found_and_replicated_ones_are_no_candidates(tmp_path: Path) -> None:
+    path = tmp_path / "frames.xml"
+    link = '<body name="{0}"><frame><joint axis="0 1 0" damping="0.1"/></frame><geom size="0.1" pos="0 0 -0.3"/></body>'
+    copies = f'<replicate count="2" offset="1 0 0">{link.format("copy")}</replicate>'
+    path.write_text(f"<mujoco><worldbody>{link.format('link')}{copies}</worldbody></mujoco>")
+    source = ModelSource(path)
+    named = {one.name for one in source.candidates(range(source.model.njnt))}
+    assert {"joint/link/damping", "body/link/mass"} <= named
+    assert not any("copy" in name for name in named)
+    with pytest.raises(ParameterError, match="states no joint 'copy0'; expected one of: link"):
+        source.parameter("joint/copy0/damping")

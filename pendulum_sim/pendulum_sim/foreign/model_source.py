@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,10 @@ from pendulum_msgs_py.atomic_write import write_atomically
 from pendulum_msgs_py.errors import ParameterError
 from pendulum_sim.foreign.mujoco_model import import_mujoco, read_model
 
-__all__ = ["ModelParameter", "ModelSource"]
+__all__ = ["WRITTEN", "ModelParameter", "ModelSource"]
+
+WRITTEN = "Identified by output error"
+"""How the comment on top of a written file begins."""
 
 _ATTRIBUTE = re.compile(rb"""\s([\w:.-]+)\s*=\s*("[^"]*"|'[^']*')""")
 _NUMBER = re.compile(rb"\S+")
@@ -162,9 +166,9 @@ class ModelSource:
         model, found = self.model, list[ModelParameter]()
         named = {int(index): name for name, index in self._indices("joint").items()}
         for joint in joints:
-            if joint in named:
-                attributes = ("damping", "frictionloss") if self.is_urdf else ("damping", "frictionloss", "armature")
-                found += [self.parameter(f"joint/{named[joint]}/{one}") for one in attributes]
+            for one in ("damping", "frictionloss", "armature") if joint in named else ():
+                with suppress(ParameterError):  # URDF has no armature, and no element states a replicated joint
+                    found.append(self.parameter(f"joint/{named[joint]}/{one}"))
         moved = {int(model.jnt_bodyid[joint]) for joint in joints}
         for body in range(1, model.nbody):
             above, name = body, str(model.body(body).name)
@@ -173,10 +177,8 @@ class ModelSource:
             if not above or not name or not model.body_mass[body] > 0.0:
                 continue
             for one in ("inertia", "ipos", "mass"):
-                try:
+                with suppress(ParameterError):  # its centre of mass is at its frame, or links were fused
                     found.append(self.parameter(f"body/{name}/{one}"))
-                except ParameterError:
-                    continue  # its centre of mass is at its frame, or links were fused
         return found
 
     def _of_joint(self, name: str, element: _Element, owner: str, attribute: str, component: str) -> ModelParameter:
@@ -254,7 +256,7 @@ class ModelSource:
         key, place = self._key(element), ""
         if attribute not in element.names:
             if value is None or at:
-                has = ", ".join(sorted(element.names))
+                has = ", ".join(sorted({*element.names, *(_OF_JOINT if element.tag == "joint" else ())} - {"name"}))
                 raise ParameterError(
                     f"{name}: the element of {self.path} does not state {attribute}; expected one of these: {has}"
                 )
@@ -300,7 +302,7 @@ class ModelSource:
             name = str(getattr(model, kind)(index).name)
             if not name and kind == "joint":
                 name = str(model.body(model.jnt_bodyid[index]).name)
-            elif not name:
+            elif not name and model.actuator_trntype[index] == int(self.mujoco.mjtTrn.mjTRN_JOINT):
                 name = str(model.joint(model.actuator_trnid[index, 0]).name)
             if name:
                 found.setdefault(name, index)
@@ -311,6 +313,8 @@ class ModelSource:
         found: dict[str, _Element] = {}
         for element in self._root.walk():
             parent = element.parent
+            while parent is not None and parent.tag == "frame":
+                parent = parent.parent
             if parent is None:
                 continue
             if kind in tags:
@@ -335,8 +339,8 @@ class ModelSource:
             compiled = {str(getattr(self.model, kind)(i).name) for i in range(getattr(self.model, f"n{_SHORT[kind]}"))}
             known &= {*compiled, *(self._indices("joint") if kind == "joint" else ())}
         if chosen is None or owner not in known:
-            listed = ", ".join(sorted(one for one in known if one and one != "world")) or "none"
-            raise ParameterError(f"{name}: {self.path} has no {kind} {owner!r}; expected one of: {listed}")
+            listed = ", ".join(sorted(one for one in known & set(found) if one and one != "world")) or "none"
+            raise ParameterError(f"{name}: {self.path} states no {kind} {owner!r}; expected one of: {listed}")
         return chosen
 
     def _key(self, element: _Element) -> int:
@@ -460,6 +464,20 @@ class ModelSource:
             at += 1
         return element.start, at + 1
 
+    def check_target(self, out: Path) -> None:
+        """Raise a ParameterError if the file cannot be written back under a name."""
+        if out.suffix != self.path.suffix:
+            raise ParameterError(f"--out is {out.name!r}; expected a name that ends in {self.path.suffix}")
+        if out.exists() and out.samefile(self.path):
+            raise ParameterError(f"--out is {out}, the model itself; expected another file")
+        if out.exists() and WRITTEN.encode() not in out.read_bytes():
+            raise ParameterError(f"--out is {out}, a file that identify has not written; expected another name")
+        if out.resolve().parent != self.path.resolve().parent and any(_FILES.search(text) for text in self._texts):
+            raise ParameterError(
+                f"{self.path} names other files by their place; expected --out in its folder, "
+                f"{self.path.resolve().parent}"
+            )
+
     def write(
         self, out: Path, parameters: Sequence[ModelParameter], values: Sequence[float], remarks: Sequence[str]
     ) -> list[Path]:
@@ -468,16 +486,9 @@ class ModelSource:
         A file that it includes is written too, with the name of ``out`` before its own, if a number stands in it.
 
         Raises:
-            ParameterError: It would be the file itself, or lies elsewhere than the files that it names, or MuJoCo
-                refuses it, or reads other numbers.
+            ParameterError: As :meth:`check_target`, or MuJoCo refuses it, or reads other numbers.
         """
-        if out.exists() and out.samefile(self.path):
-            raise ParameterError(f"--out is {out}, the model itself; expected another file")
-        if out.resolve().parent != self.path.resolve().parent and any(_FILES.search(text) for text in self._texts):
-            raise ParameterError(
-                f"{self.path} names other files by their place; expected --out in its folder, "
-                f"{self.path.resolve().parent}"
-            )
+        self.check_target(out)
         texts, written = self.texts(parameters, values), [out]
         for i, name in enumerate(self._names[1:], start=1):
             if texts[i] == self._texts[i]:
@@ -487,8 +498,8 @@ class ModelSource:
             texts = [pattern.sub(rb"\g<1>" + str(other).encode(), text) for text in texts]
             written.append(out.parent / other)
         comment = "\n     ".join(remarks).replace("--", "- -").rstrip("-").encode()
-        head = self._root.start
-        texts[0] = texts[0][:head] + b"<!-- " + comment + b" -->\n" + texts[0][head:]
+        head, end = self._root.start, b"\r\n" if b"\r\n" in texts[0] else b"\n"
+        texts[0] = texts[0][:head] + (b"<!-- " + comment + b" -->\n").replace(b"\n", end) + texts[0][head:]
         changed = [text for text, old in zip(texts, self._texts, strict=True) if text != old]
         for path, text in zip(written[1:] + written[:1], changed[1:] + changed[:1], strict=True):
             write_atomically(path, text)

@@ -39,7 +39,7 @@ Hold = Annotated[
     typer.Option(help="Input of a CSV between its samples: zero (a held command) or linear (measured)."),
 ]
 _OF_READING = frozenset({"mapping", "write_mapping", "topic", "dt"})
-_FOR_SEVERAL_JOINTS = frozenset({"plant", *_OF_READING, "window", "held_out", "out", "name", "page", "as_json"})
+_FOR_SEVERAL_JOINTS = frozenset({"plant", *_OF_READING, "hold", "window", "held_out", "out", "name", "page", "as_json"})
 _FOR_SIMULATION = _FOR_SEVERAL_JOINTS - {"name", "page"} | {"model", "parameter", "model_mapping"}
 _FOR_REGRESSION = frozenset({"method", *_OF_READING, "hold", "experiment", "skew", "out", "page", "as_json", "verbose"})
 _FOR_REGRESSION_ALONE = frozenset({"experiment", "skew", "verbose"})
@@ -133,11 +133,7 @@ def identify(
     context.call_on_close(partial(show_guesses, make_console(stderr=True), readings, write_mapping))
     if model is not None:
         _refuse_unheeded(context, "--model", _FOR_SIMULATION)
-        from pendulum_bags.identification.simulation_result import check_target
-
-        if out:
-            check_target(out, model)
-        found_in_file = _of_model(model, model_mapping, plant, parameter, readings, len(data), window)
+        found_in_file = _of_model(model, model_mapping, plant, parameter, readings, len(data), window, hold, out)
         written = found_in_file.write(out) if out and not found_in_file.refused else None
         _finish(found_in_file, written, False, as_json)
         return
@@ -152,7 +148,7 @@ def identify(
         start = load_mechanism(plant)
         if len(start.joints) == 1:
             raise DataError(f"plant {start.name!r} has one joint; expected a mechanism, or no --plant for one joint")
-        logs = [read_joints(reading, start.coordinates) for reading in readings]
+        logs = [read_joints(reading, start.coordinates, hold=hold) for reading in readings]
         if start.coordinates.volts:
             make_console(stderr=True).print(RATIOS, highlight=False)
         joints = identify_joints(start, logs[: len(data)], held_out=logs[len(data) :], window=window)
@@ -193,6 +189,8 @@ def _of_model(
     readings: Sequence[Reading],
     count: int,
     window: float | None,
+    hold: str | None,
+    out: Path | None,
 ) -> SimulationResult:
     """Return the numbers of a model file, fitted to the first ``count`` readings and scored on the others."""
     from pendulum_bags.identification.joint_recordings import read_joints
@@ -206,8 +204,11 @@ def _of_model(
     entries = load_mujoco_mapping(mapping, () if coordinates is None else coordinates.joints) if mapping else None
     if all(one.motion.joints[0].drive is None for one in readings) and coordinates is None:
         coordinates = replace(ONE_JOINT, driven=())
-    motion = MujocoMotion(ModelSource(path), entries, coordinates)
-    logs = [read_joints(reading, motion.coordinates) for reading in readings]
+    source = ModelSource(path)
+    if out is not None:
+        source.check_target(out)
+    motion = MujocoMotion(source, entries, coordinates)
+    logs = [read_joints(reading, motion.coordinates, hold=hold) for reading in readings]
     wanted = dict(map(_wanted, parameters or ()))
     options = {"mapping": str(mapping)} if mapping else {}
     if plant is not None:

@@ -21,7 +21,7 @@ from pendulum_bags.identification.joint_readings import explained_joints, refusa
 from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.joint_search import search
 from pendulum_bags.identification.joint_uncertainty import assess_joints, each_alone, hold_undetermined
-from pendulum_bags.identification.motion_model import MotionModel
+from pendulum_bags.identification.motion_model import DELAY, MotionModel
 from pendulum_bags.identification.options import DEFAULTS, Options
 from pendulum_bags.identification.output_error import OutputErrorFit, fit_output_error
 from pendulum_bags.identification.own_offsets import OwnOffsets
@@ -34,6 +34,8 @@ from pendulum_bags.identification.result import (
     check_distinct,
     data_sentences,
     fingerprint,
+    held_sentence,
+    looks_held,
 )
 from pendulum_bags.identification.solver import solve
 from pendulum_bags.identification.uncertainty import Uncertainty, assess
@@ -247,7 +249,9 @@ def identify_motions(
     account = explained_joints(found, refusal(found, training, outside) or lost(found, uncertainty))
     sizes = dict.fromkeys((name for name in start.sizes if name in found.free), _ONE_SIZE)
     account, two = _one_machine(account, excluding(alone, sizes, found.model.unit))
-    notes = _notes(recordings, best.pushed)
+    notes, delay = _notes(recordings, best.pushed), uncertainty.intervals.get(DELAY)
+    if delay is not None:
+        notes += [held_sentence(one.name, delay, one) for one in recordings if looks_held(one, delay)]
     if found.own:
         zeros = OwnOffsets(found.own, found.offsets - found.offsets.mean(axis=0))
         notes.append(zeros.sentence(names[: len(recordings)], found.model.unit))

@@ -116,7 +116,10 @@ class JointRecording:
 
 
 def read_joints(
-    path: str | os.PathLike[str], coordinates: Coordinates, mapping: str | Path | None = None
+    path: str | os.PathLike[str],
+    coordinates: Coordinates,
+    mapping: str | Path | None = None,
+    hold: str | None = None,
 ) -> JointRecording:
     """Read a recording of every joint.
 
@@ -127,6 +130,7 @@ def read_joints(
         path: File or folder, or a :class:`~pendulum_bags.recordings.reading.Reading`.
         coordinates: Joints of the plant, and which are driven.
         mapping: Mapping file; by default the columns are guessed, ``JOINT.position`` and ``JOINT.effort`` surely.
+        hold: Of a file's efforts, ``zero`` (commands) or ``linear`` (measurements), in place of the mapping's.
 
     Raises:
         BagError: The bag cannot be read.
@@ -164,7 +168,7 @@ def read_joints(
             measured = drive is not None and not drive.own_clock and index not in coordinates.driven
             part = recording_of(motion, replace(moved, velocity=None, drive=None if measured else drive))
         else:
-            part = recording_of(motion, moved)
+            part = recording_of(motion, moved, hold)
         parts.append(check_consistency(unwrap(part)) if joint.turns else check_consistency(part))
     time, position = parts[0].time, np.stack([part.position for part in parts], axis=1)
     velocities = [moved.velocity for moved in ordered if is_bag and moved.velocity is not None]
@@ -179,7 +183,7 @@ def read_joints(
         sum(int(motion.meta.get(key, 0)) for key in ("repeated_stamps", "repeated_states", "nan_rows")),
         _passive(coordinates, [bool(np.any(part.input)) for part in parts]),
         None if velocity is None else _tracks_position(time, position, velocity),
-        motion.meta,
+        {**motion.meta, "hold_assumed": any(part.meta.get("hold_assumed") for part in parts)},
         renamed,
     )
     return _chosen_part(recording, reading)

@@ -43,7 +43,9 @@ __all__ = [
     "check_distinct",
     "data_sentences",
     "fingerprint",
+    "held_sentence",
     "load_fit_model",
+    "looks_held",
 ]
 
 FORMAT = "pendulum_identification/1"
@@ -454,17 +456,18 @@ class PendulumResult(IdentificationResult):
         return intervals, remarks
 
 
-def _looks_held(recording: Recording, delay: Interval) -> bool:
+def looks_held(recording: Recording | JointRecording, delay: Interval) -> bool:
     """Return whether an input read as straight lines is late by half a sample, as one that is held would be."""
-    if recording.hold != "linear" or not recording.meta.get("hold_assumed"):
+    if "linear" not in recording.hold or not recording.meta.get("hold_assumed"):
         return False
     half = 0.5 * recording.period
     return abs(delay.value - half) < 0.2 * half and delay.low > 0.25 * half and delay.high < 1.75 * half
 
 
-def _held(name: str, delay: Interval, recording: Recording) -> str:
+def held_sentence(name: str, delay: Interval, recording: Recording | JointRecording) -> str:
+    """Return what a delay of half a sampling period means."""
     return (
-        f"{name}: transport_delay is {1e3 * delay.value:.3g} ms, half of the sampling period of "
+        f"{name}: the delay is {1e3 * delay.value:.3g} ms, half of the sampling period of "
         f"{1e3 * recording.period:.3g} ms. The torque was read as a measurement that varies between its samples; if "
         "it is a command that is held until the next one, this delay is none: say `--hold zero`, or `hold: zero` in a "
         "mapping file."
@@ -476,7 +479,7 @@ def data_sentences(fit: OutputErrorFit, delay: Interval | None, *, refused: bool
     named = list(zip(distinct_names([p.recording for p in fit.pieces]), fit.pieces, strict=True))
     said = [f"{name}: {note}" for name, piece in named for note in data_notes(piece.recording)]
     if delay is not None:
-        said += [_held(name, delay, p.recording) for name, p in named if _looks_held(p.recording, delay)]
+        said += [held_sentence(name, delay, p.recording) for name, p in named if looks_held(p.recording, delay)]
     if fit.zeros is not None:
         said.append(fit.zeros.sentence([name for name, _ in named], fit.model.unit))
     if fit.sign_flipped and not refused:

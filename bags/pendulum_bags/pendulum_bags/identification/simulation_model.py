@@ -26,7 +26,7 @@ from pendulum_sim.foreign.model_source import ModelParameter, ModelSource
 from pendulum_sim.foreign.mujoco_joints import find_joints
 from pendulum_sim.foreign.mujoco_mapping import MujocoMapping
 
-__all__ = ["MujocoMotion", "SimulationModel", "between_steps", "check_alone", "check_efforts"]
+__all__ = ["LEAST", "MujocoMotion", "SimulationModel", "between_steps", "check_alone", "check_efforts"]
 
 _CACHED = 64
 """Compiled models that are kept."""
@@ -34,7 +34,7 @@ _CACHED = 64
 _NO_LIMIT = 1e9
 """Largest effort of a file that states none: the recorded ones count [N m or N]."""
 
-_LEAST = 0.02
+LEAST = 0.02
 """Share of its value in the file below which a positive parameter does not go."""
 
 
@@ -309,7 +309,7 @@ class SimulationModel(MotionModel):
             return self.limits[name]
         if one is None or one.signed:
             return -np.inf, np.inf
-        return _LEAST * one.value if one.positive else 0.0, np.inf
+        return LEAST * one.value if one.positive else 0.0, np.inf
 
     def size(self, name: str) -> float:
         """Return a scale of a parameter, in its unit."""

@@ -27,17 +27,22 @@ from pendulum_bags.identification.joint_recordings import JointRecording
 from pendulum_bags.identification.joint_search import default_window
 from pendulum_bags.identification.motion_model import DELAY
 from pendulum_bags.identification.result import IdentificationResult
-from pendulum_bags.identification.simulation_model import MujocoMotion, SimulationModel, check_alone, check_efforts
+from pendulum_bags.identification.simulation_model import (
+    LEAST,
+    MujocoMotion,
+    SimulationModel,
+    check_alone,
+    check_efforts,
+)
 from pendulum_bags.identification.uncertainty import Uncertainty
 from pendulum_bags.runs.run_folder import write_json
 from pendulum_msgs_py.errors import DataError
 from pendulum_msgs_py.plants.determined import SPAN
-from pendulum_sim.foreign.model_source import ModelParameter
+from pendulum_sim.foreign.model_source import WRITTEN, ModelParameter
 
 __all__ = [
     "Identifiability",
     "SimulationResult",
-    "check_target",
     "identifiability",
     "identify_simulation",
     "undetermined_numbers",
@@ -48,6 +53,9 @@ _ORDER = ("damping", "frictionloss", "inertia", "ipos", "mass", "armature")
 
 _SAME = 0.02
 """Share of a number's effect that must be left after others have explained what they can, or they are one."""
+
+_NOTHING = 1e-3
+"""Effect of twice a number, in standard deviations of the noise over all samples, that is rounding."""
 
 _TELLS = 0.05
 """Largest relative standard error, by the sensors' noise alone, of a number that is proposed."""
@@ -136,7 +144,7 @@ def identifiability(
     order = sorted(range(len(names)), key=lambda i: (_rank(names[i]), i)) if propose else range(len(names))
     for i in order:
         left = float(np.linalg.norm(without(basis, effects[:, i]))) if basis.size else norm[i]
-        if not norm[i] > 1e-9:
+        if not norm[i] > _NOTHING:
             same[names[i]] = "no effect on what was recorded: held"
         elif left < _SAME * norm[i]:
             same[names[i]] = f"held: {_likeness(names, effects, i, chosen)}"
@@ -152,7 +160,7 @@ def identifiability(
     use = without(rest, effects[:, chosen]) if rest.size else effects[:, chosen]
     _, singular, right = np.linalg.svd(use / np.maximum(np.linalg.norm(use, axis=0), 1e-300), full_matrices=False)
     with np.errstate(divide="ignore"):
-        alone = size / np.where(norm > 1e-9, norm, 0.0)
+        alone = size / np.where(norm > _NOTHING, norm, 0.0)
     return Identifiability(model.parameters, alone, size * together, tuple(chosen), same, singular, right[-1])
 
 
@@ -223,7 +231,7 @@ class SimulationResult(IdentificationResult):
             elif not low < value < high:
                 said.append(
                     f"{one.name} ended at the edge of its domain, {value:.4g} {one.unit}: the motion wants "
-                    f"{'less' if value <= low else 'more'}. Some number that is held is wrong: fit it too."
+                    f"{'less' if value <= low else 'more'}."
                 )
         said += [f"{one.name} is put into {one.place}." for one in self._written if one.place]
         for one in self._written:
@@ -269,35 +277,37 @@ class SimulationResult(IdentificationResult):
         """Write the model file with the identified numbers, and all the rest as JSON of the same name.
 
         Raises:
-            DataError: The fit is refused, or the name has another suffix than the file.
-            ParameterError: MuJoCo does not read back what was written.
+            DataError: The fit is refused.
+            ParameterError: A file may not have this name, or MuJoCo does not read back what was written.
         """
         source, target = self.model.motion.source, Path(path)
         if self.refused:
             raise DataError(f"{self.refusal} No file is written.")
-        check_target(target, source.path)
         listing = []
         for one in self._written:
             found = self.intervals.get(one.name)
             ends = f", 95 % interval {found.text}" if found is not None else ""
             listing.append(f"{one.name}: {self.model[one.name]:.6g} {one.unit} (was {one.value:.6g}{ends})")
         data = ", ".join(f"{Path(one['source']).name} (sha256 {one['sha256']})" for one in self.data)
-        head = f"Identified by output error from {data}, {self.created}, in {source.path.name}:"
+        head = f"{WRITTEN} from {data}, {self.created}, in {source.path.name}:"
         values = [self.model[one.name] for one in self._written]
         source.write(target, self._written, values, [head, *listing, f"{self.verdict}"])
         write_json(target.with_suffix(".json"), self.to_dict())
         return target
 
 
-def check_target(target: Path, model: Path) -> None:
-    """Raise a DataError if a model file cannot be written back under a name."""
-    if target.suffix != model.suffix:
-        raise DataError(f"--out is {target.name!r}; expected a name that ends in {model.suffix}")
-
-
 def undetermined_numbers(found: JointFit, uncertainty: Uncertainty) -> str | None:
     """Return which numbers the recordings leave open, in a sentence; an inertia may be a small part of what moves."""
     model = found.model
+    assert isinstance(model, SimulationModel)
+    for name in model.sizes:
+        value, low = model[name], model.bounds(name)[0]
+        if name in found.free and name not in model.limits and value <= low:
+            return (
+                f"{REFUSED}: the motion wants {name} below {value:.4g} {model.unit(name)}, {LEAST:g} of what "
+                f"{model.label} has; expected a bound of yours (--parameter {name}=LOW:HIGH) or, if another number is "
+                "wrong, that one in its place (--parameter, once for each number to fit)"
+            )
     lost = [
         f"{name} ({one.text} {model.unit(name)})"
         for name, one in uncertainty.intervals.items()
