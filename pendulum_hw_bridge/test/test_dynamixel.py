@@ -204,6 +204,12 @@ def test_a_reply_is_awaited_for_most_of_a_period_and_never_long(rate: float, pat
     assert (drive.clock.now_ns() - before) / 1e9 == pytest.approx(patience, abs=1e-5)
 
 
+def test_a_record_that_is_due_at_the_very_end_of_the_wait_is_asked_for() -> None:
+    drive = ready()
+    drive.port._next_ns = drive.clock.now_ns() + 20 * MILLISECOND
+    assert drive.port.read(0.02) is not None
+
+
 def test_no_torque_is_sent_while_the_strategy_is_off() -> None:
     drive = ready()
     applied = drive.port.write(Command(effort=0.2))
@@ -433,6 +439,8 @@ def test_the_smallest_and_the_largest_limit_are_set() -> None:
 )
 def test_a_stop_that_is_not_confirmed_names_what_was_seen(fault: ActuatorFault, sentence: str) -> None:
     drive = driven()
+    # Another servo of the line, not connected yet, changes nothing.
+    drive.port.on_this_bus({"drive_id": 2, "drive_model": "XL330-M288"})
     drive.faults.add(fault)
     with pytest.raises(ActuatorError, match=f"servo 1 {sentence}; expected 0"):
         drive.port.stop()
@@ -691,6 +699,14 @@ def test_torque_of_a_servo_does_not_wait_for_the_stop_of_a_silent_one(silent: in
     # Of three times 15 ms, the first.
     assert sum(each != 0 for each in goals) <= 17
     assert goals[-1] == 0
+
+
+def test_a_line_that_fails_for_all_servos_is_asked_as_often_as_for_one() -> None:
+    drive, _, first, _ = two_driven()
+    drive.faults.add(ActuatorFault.SEND_FAILED)
+    with pytest.raises(ActuatorError, match="asked 3 times") as caught:
+        first.stop()
+    assert caught.value.fault == "stop_unacknowledged"
 
 
 @pytest.fixture

@@ -98,7 +98,7 @@ def check(
         document = {"ready": found.ready, "host_busy": found.host_busy, "items": items, "figures": found.figures}
         print(json_text(document))
     else:
-        _print(found)
+        _print(found, "motion stop" if BACKENDS[values["backend"]].bounds.m_stop else "switch of its supply")
     if found.ready:
         return 0
     return EXIT_NOT_READY if found.refused else EXIT_BUSY
@@ -131,7 +131,7 @@ def _go_through(
     )
 
 
-def _print(found: Checklist) -> None:
+def _print(found: Checklist, stop: str) -> None:
     table = WholeTable("", "check", "seen", "expected", title="Before arming")
     marks = {True: "[green]ok[/green]", False: "[bold red]NO[/bold red]", None: "[yellow]?[/yellow]"}
     for item in found.items:
@@ -142,7 +142,7 @@ def _print(found: Checklist) -> None:
         if item.passed is False and item.hint:
             console.print(f"{item.name}: {item.hint}", style="red", highlight=False, markup=False)
     if found.ready:
-        console.print("Ready. Keep a hand on the motion stop, and nobody in the pendulum's plane.", style="green")
+        console.print(f"Ready. Keep a hand on the {stop}, and nobody in the pendulum's plane.", style="green")
         if found.untried:
             console.print(f"Not tried: {', '.join(found.untried)}.", style="yellow")
     elif found.refused:
