@@ -99,6 +99,7 @@ def test_angle_and_velocity_come_in_radians_with_their_sign(angle: float) -> Non
     assert found.position == pytest.approx(position, abs=1.6e-3)
     assert found.velocity == pytest.approx(velocity, abs=0.013)
     assert found.position == pytest.approx(angle, abs=0.1)
+    assert found.voltage == pytest.approx(drive.servo.voltage)
 
 
 def test_a_torque_limit_is_rounded_down_and_none_beyond_it_is_sent() -> None:
@@ -274,6 +275,19 @@ def test_replies_that_stay_late_are_no_feedback_at_any_rate(rate: float, late: f
     drive.line.tamper = lambda due_ns, packet: [(due_ns, packet)]
     drive.clock.wait_until(drive.clock.now_ns() + 100 * MILLISECOND)
     assert drive.port.read(0.02) is not None
+
+
+def test_after_single_lost_replies_the_next_is_asked_for_in_time() -> None:
+    drive = ready()
+    sent: list[bytes] = []
+
+    def every_second(due_ns: int, packet: bytes) -> list[tuple[int, bytes]]:
+        sent.append(packet)
+        return [(due_ns, packet)] if len(sent) % 2 else []
+
+    drive.line.tamper = every_second
+    stamps = [found.stamp_ns for _ in range(80) if (found := drive.port.read(0.02)) is not None]
+    assert np.diff(stamps)[1:] == pytest.approx(20e6, abs=1e6)
 
 
 def test_damaged_foreign_and_short_packets_are_no_feedback_and_the_next_good_one_is() -> None:
