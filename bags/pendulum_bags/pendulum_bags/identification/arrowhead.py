@@ -36,6 +36,13 @@ __all__ = [
     "robust_cost",
 ]
 
+_FEW, _HELD = 0.25, 1e4
+"""Share of the windows that may spoil a step by their own states alone, and their damping above which they cannot.
+
+Where a joint comes to rest the loss has a kink, and derivatives with respect to a window's state mislead there. One
+such window must not shorten the steps of all others, or the search ends far from the minimum.
+"""
+
 _STUCK, _PROGRESS = 10, 0.99
 """Steps over which a hopeless search has to take its cost below a share of what it was, or ends."""
 
@@ -133,13 +140,14 @@ def robust_cost(errors: Array, scale: float) -> float:
     return float(2.0 * scale * scale * np.sum(np.sqrt(1.0 + ratio * ratio) - 1.0))
 
 
-def _loss(motion: Motion[M], model: M, states: Array) -> float:
-    errors = motion.errors(model, states)
-    return robust_cost(errors, motion.scale) if np.isfinite(errors).all() else np.inf
+def _loss(errors: Array, scale: float) -> float:
+    return robust_cost(errors, scale) if np.isfinite(errors).all() else np.inf
 
 
-def _normal_equations(motion: Motion[M], model: M, states: Array, names: Sequence[str]) -> tuple[float, Blocks]:
-    """Return loss and normal equations of one recording; the loss is inf where a derivative overflows."""
+def _normal_equations(
+    motion: Motion[M], model: M, states: Array, names: Sequence[str]
+) -> tuple[float, Blocks, list[int]]:
+    """Return loss, normal equations and ends of windows; the loss is inf where a derivative overflows."""
     sensitivity, errors, ends = motion.sensitivities(model, states, names)
     loss, (k, width) = robust_cost(errors, motion.scale), (len(names), sensitivity.shape[1])
     if math.isfinite(motion.scale):
@@ -157,7 +165,7 @@ def _normal_equations(motion: Motion[M], model: M, states: Array, names: Sequenc
         gradient[:, :k].sum(axis=0),
         gradient[:, k:],
     )
-    return (loss if math.isfinite(float(matrix.sum())) else np.inf), blocks
+    return (loss if math.isfinite(float(matrix.sum())) else np.inf), blocks, ends
 
 
 @dataclass(frozen=True)
@@ -215,10 +223,22 @@ def minimise(
             vector[index[at]] = values[at]
         return list(map(model.with_vector, vectors)) if m else [model.with_vector(vectors[0])] * count
 
+    def losses_of(models: Sequence[M], x: Sequence[Array]) -> Array:
+        errors = [motion.errors(one, state) for motion, one, state in zip(motions, models, x, strict=True)]
+        return np.array(
+            [
+                _loss(each[a:b], motion.scale)
+                for each, motion, some in zip(errors, motions, cuts, strict=True)
+                for a, b in itertools.pairwise(some)
+            ]
+        )
+
     def linearise() -> tuple[float, Blocks]:
         blocks, cost = Blocks.zeros(len(names), ends[-1], x[0].shape[1] if count > 1 else 0), prior.cost(found)
         for one, motion, at, state, (a, b) in zip(best, motions, columns, x, itertools.pairwise(ends), strict=True):
-            loss, part = _normal_equations(motion, one, state, (*free, *own))
+            loss, part, cut = _normal_equations(motion, one, state, (*free, *own))
+            if len(cuts) < count:
+                cuts.append(cut)
             if not math.isfinite(loss):
                 return np.inf, blocks
             cost += loss
@@ -232,8 +252,9 @@ def minimise(
         blocks.g_p[:] += prior.weights * (found - prior.values)
         return cost, blocks
 
-    best = models(found)
+    best, cuts = models(found), list[list[int]]()
     damping, converged = 1e-4, False
+    held = np.full(ends[-1], damping)
     cost, blocks = linearise()
     before, costs, current = (found, best, x, cost, blocks), [cost], True
     for _ in range(max_iterations if math.isfinite(cost) else 0):
@@ -247,7 +268,7 @@ def minimise(
                 # So far along an unstable motion the derivatives have no size: a smaller step.
                 found, best, x, cost, blocks = before
                 damping *= 40.0
-        step = _damped_step(blocks, found, low, high, damping, size)
+        step = _damped_step(blocks, found, low, high, damping, np.maximum(held, damping), size)
         if step is None:
             damping *= 10.0
             if damping > 1e12:
@@ -262,14 +283,19 @@ def minimise(
         x_trial = [state + d_x[a:b] for state, (a, b) in zip(x, itertools.pairwise(ends), strict=True)]
         new_cost = prior.cost(trial)
         for one, motion, state in zip(candidates, motions, x_trial, strict=True):
-            new_cost += _loss(motion, one, state)
+            new_cost += _loss(motion.errors(one, state), motion.scale)
         if new_cost < cost:
             before, current = (found, best, x, cost, blocks), False
             good = (cost - new_cost) / max(gain, 1e-300) > 0.25
             damping = max(damping * (0.2 if good else 1.0), 1e-10)
+            held = np.maximum(0.2 * held, 1e-10)
             converged = (cost - new_cost) / cost < tolerance
             found, best, x, cost = trial, candidates, x_trial, new_cost
         else:
+            spoilt = losses_of(candidates, x_trial) - losses_of(best, x) > gain
+            if 0 < np.count_nonzero(spoilt) <= _FEW * spoilt.size and held[spoilt].max() < _HELD:
+                held[spoilt] = 40.0 * np.maximum(held[spoilt], damping)
+                continue
             damping *= 5.0
             converged = gain < tolerance * cost or damping > 1e10
         if converged:
@@ -281,11 +307,14 @@ def minimise(
 
 
 def _damped_step(
-    blocks: Blocks, values: Array, low: Array, high: Array, damping: float, size: Array
+    blocks: Blocks, values: Array, low: Array, high: Array, damping: float, held: Array, size: Array
 ) -> tuple[Array, Array, float] | None:
-    """Return the step of parameters and states and the decrease it predicts, or None if the system is singular."""
+    """Return the step of parameters and states and the decrease it predicts, or None if the system is singular.
+
+    ``held`` is the damping of the states of each window, shape (w,).
+    """
     k = blocks.g_p.size
-    reduced, gradient, inverses = eliminate(blocks.h_pp, blocks.h_px, blocks.h_xx, blocks.g_p, blocks.g_x, damping)
+    reduced, gradient, inverses = eliminate(blocks.h_pp, blocks.h_px, blocks.h_xx, blocks.g_p, blocks.g_x, held)
     d_p = np.zeros(k)
     if k:
         own = np.maximum(blocks.h_pp.diagonal(), 0.0) * size**2
@@ -323,11 +352,12 @@ def bounded_step(system: Array, gradient: Array, values: Array, low: Array, high
 
 @njit(cache=True)
 def eliminate(
-    h_pp: Array, h_px: Array, h_xx: Array, g_p: Array, g_x: Array, damping: float
+    h_pp: Array, h_px: Array, h_xx: Array, g_p: Array, g_x: Array, damping: Array
 ) -> tuple[Array, Array, Array]:
     """Return the reduced matrix (k, k), the reduced gradient (k,) and the inverse damped state blocks (w, x, x).
 
-    Arguments as in :class:`Blocks`; ``damping`` is the share of the state blocks' diagonal that is added to it.
+    Arguments as in :class:`Blocks`; ``damping`` is the share of each state block's diagonal that is added to it,
+    shape (w,).
     """
     k, x = h_px.shape[1], h_px.shape[2]
     reduced, gradient, inverses = h_pp.copy(), g_p.copy(), h_xx.copy()
@@ -339,7 +369,7 @@ def eliminate(
         # A state that a wrong model's motion hardly shows must not stop the search.
         least = 1e-14 * largest if largest > 0.0 else 1.0
         for i in range(x):
-            inverse[i, i] += damping * (inverse[i, i] + 1e-12) + least
+            inverse[i, i] += damping[n] * (inverse[i, i] + 1e-12) + least
         for i in range(x):  # Gauss-Jordan; the block is positive definite, which needs no pivoting
             pivot = 1.0 / max(inverse[i, i], least)
             inverse[i, i] = 1.0
