@@ -390,6 +390,16 @@ def test_what_to_do_about_a_simulation_of_others_is_done_in_it(plant: PlantParam
         assert ("lab.xml" in step, "--plant" in step) == (named, not named)
 
 
+def test_a_model_file_that_simulated_is_identified_itself() -> None:
+    simulation, hardware = pair(5, plant=SIMULATED.with_values(damping=2 * 11.77), late=0.01)
+    command = "pendulum experiment thesis --simulation 'my lab/arm.urdf' --mapping lab.yaml --out run"
+    record = {"simulation": {"name": "arm.urdf"}, "command": f"python {command}"}
+    foreign = replace(simulation, metadata={"pendulum.run": record})
+    (step,) = same_run_layer(compare([(foreign, hardware)])).next_steps
+    assert "--model 'my lab/arm.urdf' --model-mapping lab.yaml --out arm_identified.urdf)" in step
+    assert step.endswith("measure again with --simulation arm_identified.urdf --mapping lab.yaml.")
+
+
 def test_looking_again_widens_the_intervals_so_that_all_looks_together_err_no_more() -> None:
     spent = sum(1.0 - Looks(number).level for number in range(1, 60))
     assert spent == pytest.approx(0.1)

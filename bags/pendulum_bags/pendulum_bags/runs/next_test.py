@@ -8,7 +8,15 @@ from itertools import count, pairwise
 from pathlib import Path
 from typing import Any
 
-__all__ = ["MACHINE_FILE", "measurement_of", "next_test_of", "plant_file_of", "question_of", "with_budget"]
+__all__ = [
+    "MACHINE_FILE",
+    "measurement_of",
+    "model_options",
+    "next_test_of",
+    "plant_file_of",
+    "question_of",
+    "with_budget",
+]
 
 _EXPERIMENTS = ("thesis", "joints")
 MACHINE_FILE = "machine.yaml"
@@ -19,6 +27,7 @@ else's simulation would stand where the plant is to."""
 _OF_THE_CASE = ("--plant", "--simulation", "--mapping", "--strategy")
 """Options that say which plants an experiment is of; those that measure other layers take them too."""
 _PLANT_FILES = (".yaml", ".yml")
+_MODEL_FILES = (".xml", ".urdf")
 _LEFT_OUT = ("--yes", "--json")
 """The question whether a machine may move is asked again, and the answer is for a reader."""
 
@@ -51,6 +60,18 @@ def measurement_of(records: Sequence[Mapping[str, Any]], experiment: str) -> str
             options = [(name, value) for name in _OF_THE_CASE for value in _values_of(name, words)[-1:]]
             return shlex.join([*words[:4], experiment, *(word for pair in options for word in pair)])
     return ""
+
+
+def model_options(records: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
+    """Return the options that identify a simulation's MuJoCo or URDF file, and those that run the result, or ""."""
+    for words in map(_words, records):
+        for model in map(Path, _values_of("--simulation", words)):
+            if model.suffix in _MODEL_FILES:
+                out = shlex.quote(f"{model.stem}_identified{model.suffix}")
+                mapping = "".join(shlex.quote(value) for value in _values_of("--mapping", words)[-1:])
+                of, run = (f" --{name} {mapping}" if mapping else "" for name in ("model-mapping", "mapping"))
+                return f"--model {shlex.quote(str(model))}{of} --out {out}", f"--simulation {out}{run}"
+    return "", ""
 
 
 def with_budget(records: Sequence[Mapping[str, Any]], seconds: float = 0.0) -> str:

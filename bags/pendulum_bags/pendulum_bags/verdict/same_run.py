@@ -10,7 +10,14 @@ from typing import Any
 
 from pendulum_bags.comparison import Comparison, EquivalenceTest, Outcome
 from pendulum_bags.runs.case import Case
-from pendulum_bags.runs.next_test import measurement_of, next_test_of, plant_file_of, question_of, with_budget
+from pendulum_bags.runs.next_test import (
+    measurement_of,
+    model_options,
+    next_test_of,
+    plant_file_of,
+    question_of,
+    with_budget,
+)
 from pendulum_bags.runs.run_folder import REPEATS
 from pendulum_bags.runs.run_record import run_record
 from pendulum_bags.verdict.layers import Evidence, Layer, LayerResult, Mark
@@ -212,8 +219,9 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest], refused
     elif moves_otherwise:
         fitted = "" if foreign else plant_file_of(_records(comparison))
         out = _next_file(fitted)
-        identify = f"python -m pendulum_bags identify {source} --out {shlex.quote(out)}"
-        if comparison.pairs[0].hardware.joint:
+        model, again = model_options(_records(comparison)) if foreign else ("", "")
+        identify = f"python -m pendulum_bags identify {source} {model or f'--out {shlex.quote(out)}'}"
+        if not model and comparison.pairs[0].hardware.joint:
             identify = f"{identify} --plant {shlex.quote(simulated_plant(comparison))}"
         begin = "Identify the plant from what the hardware did"
         if fitted:
@@ -222,7 +230,9 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest], refused
             )
         steps.append(
             f"{begin} ({identify}), then "
-            + (f"carry its values over to {foreign}." if foreign else _test_of_the_plant(comparison, out))
+            + (f"measure again with {again}." if model else "")
+            + (f"carry its values over to {foreign}." if foreign and not model else "")
+            + ("" if foreign else _test_of_the_plant(comparison, out))
         )
         if fitted:
             steps.append(
