@@ -263,6 +263,23 @@ def test_replies_that_stay_some_requests_behind_are_no_feedback(behind: int) -> 
     assert [drive.port.read(0.02) for _ in range(12)] == [None] * 12
 
 
+def test_a_setting_that_is_read_back_late_is_never_taken_for_another() -> None:
+    drive = ready()
+    line = drive.line
+    queue: list[bytes] = []
+
+    def behind(due_ns: int, packet: bytes) -> list[tuple[int, bytes]]:
+        queue.append(packet)
+        return [(due_ns, queue.pop(0))] if len(queue) > 1 else []
+
+    line.tamper = behind
+    # The watchdog's 5 once came as a hardware error, and as any other register of one byte.
+    with pytest.raises(ActuatorError, match="servo 1 does not answer"):
+        drive.port._get(module.WATCHDOG)
+    with pytest.raises(ActuatorError, match="servo 1 does not answer"):
+        drive.port._refuse_alert()
+
+
 @pytest.mark.parametrize(
     ("rate", "late"),
     [(100.0, 0.034), (100.0, 0.041), (250.0, 0.0165), (500.0, 0.0085), (500.0, 0.0165), (500.0, 0.0305)],

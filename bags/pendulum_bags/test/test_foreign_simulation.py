@@ -193,7 +193,7 @@ def test_two_simulations_of_others_are_compared_without_a_process(model: Path, t
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"hardware": "hebii"}, "hardware is 'hebii'; expected one of emulator, hebi, a model file"),
+        ({"hardware": "hebii"}, "hardware is 'hebii'; expected one of emulator, hebi, dynamixel, a model file"),
         ({"hardware": "ros:lab"}, "plant is 'ros:lab'; expected ros:/NAMESPACE"),
         ({"simulation": "ros:/"}, "plant is 'ros:/'; expected ros:/NAMESPACE"),
         ({"simulation": "ros:/hw"}, "both plants are in /hw; expected two namespaces"),

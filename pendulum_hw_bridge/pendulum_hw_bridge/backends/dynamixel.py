@@ -286,9 +286,11 @@ class DynamixelBackend(TorqueDrive):
     def _get(self, register: Register) -> int:
         """Read a register; ActuatorError without a reply, or if the servo reports an error of its own."""
         for _ in range(_ATTEMPTS):
-            reply = self._ask(register.address, register.size, _PATIENCE)
+            # Of another length than the requests before, whose replies may be late.
+            self._turn = (self._turn + 1) % len(_SPANS)
+            reply = self._ask(register.address, 4 + self._turn, _PATIENCE)
             if reply is not None and not reply[1] & ~_ALERT:
-                return int.from_bytes(reply[0], "little", signed=register.signed)
+                return int.from_bytes(reply[0][: register.size], "little", signed=register.signed)
             self._settle()
         raise ActuatorError(
             "module_lost",

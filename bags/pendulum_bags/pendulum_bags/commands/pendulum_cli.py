@@ -47,6 +47,7 @@ SECTIONS: dict[str, dict[str, str]] = {
     "Plants": {
         "simulator": "pendulum_sim simulator",
         "mujoco": "pendulum_sim mujoco",
+        "fmu": "pendulum_sim fmu",
         "gymnasium": "pendulum_sim gymnasium",
         "adopt": "pendulum_sim adopt",
         "bridge": "pendulum_hw_bridge bridge",
