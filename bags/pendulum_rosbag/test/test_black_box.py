@@ -97,7 +97,8 @@ def test_an_e_stop_of_the_emulated_x5_9_leaves_a_bag_whose_path_is_in_diagnostic
             peer.torque = 1.0
             # Diagnostics report the commander before the first period that applies its torque has been recorded.
             applied.clear()
-            peer.until(lambda: 1.0 in applied, "torque")
+            # Several, since a busy recorder may lose one of them.
+            peer.until(lambda: applied.count(1.0) >= 5, "torque")
             assert peer.call(Trigger, "bridge/e_stop", Trigger.Request()).success
             bags = [folder, folder.with_name("stops_2")][:number]
             recorder.wait_for_output(rf"recorded .* in {bags[-1]}[,;]", 120.0)
