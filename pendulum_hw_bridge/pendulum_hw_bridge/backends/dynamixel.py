@@ -393,7 +393,7 @@ class DynamixelBackend(TorqueDrive):
         )
 
     def _measured_ns(self, tick: int, now_ns: int) -> int:
-        """Return the servo's clock, without its overflow [ns]; after a restart it begins anew."""
+        """Return the servo's clock, without its overflow [ns]; a restart resets it."""
         before = self._ticks
         passed = 0 if before is None else (tick - before) % _TICKS
         elapsed = now_ns - self._tick_ns

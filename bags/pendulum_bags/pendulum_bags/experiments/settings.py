@@ -20,6 +20,7 @@ from pendulum_bags.experiments.run_spec import (
 )
 from pendulum_bags.experiments.simulation import ForeignSimulation
 from pendulum_bags.runs.case import IDENTITY, identity_of
+from pendulum_bags.runs.next_test import MUJOCO_FILES
 from pendulum_bags.runs.run_folder import provenance
 from pendulum_bags.runs.run_record import RUN_RECORD, SURROGATE
 from pendulum_lqr.controller_interface.controller import controller_parameters
@@ -48,7 +49,7 @@ __all__ = [
 ]
 
 HARDWARE = ("emulator", "hebi")
-MODEL_FILES = (".xml", ".mjcf", ".urdf", ".fmu")
+MODEL_FILES = (*MUJOCO_FILES, ".fmu")
 DEFAULT_STRATEGY = "direct_pwm"
 OF_DRIVES = "current_loop"
 """Reported in place of a strategy for drives with a current loop."""

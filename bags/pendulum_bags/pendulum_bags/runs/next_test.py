@@ -10,6 +10,7 @@ from typing import Any
 
 __all__ = [
     "MACHINE_FILE",
+    "MUJOCO_FILES",
     "measurement_of",
     "model_options",
     "next_test_of",
@@ -27,7 +28,8 @@ else's simulation would stand where the plant is to."""
 _OF_THE_CASE = ("--plant", "--simulation", "--mapping", "--strategy")
 """Options that say which plants an experiment is of; those that measure other layers take them too."""
 _PLANT_FILES = (".yaml", ".yml")
-_MODEL_FILES = (".xml", ".urdf")
+MUJOCO_FILES = (".xml", ".mjcf", ".urdf")
+"""Endings of the model files that MuJoCo reads."""
 _LEFT_OUT = ("--yes", "--json")
 """The question whether a machine may move is asked again, and the answer is for a reader."""
 
@@ -66,7 +68,7 @@ def model_options(records: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
     """Return the options that identify a simulation's MuJoCo or URDF file, and those that run the result, or ""."""
     for words in map(_words, records):
         for model in map(Path, _values_of("--simulation", words)):
-            if model.suffix in _MODEL_FILES:
+            if model.suffix in MUJOCO_FILES:
                 out = shlex.quote(f"{model.stem}_identified{model.suffix}")
                 mapping = "".join(shlex.quote(value) for value in _values_of("--mapping", words)[-1:])
                 of, run = (f" --{name} {mapping}" if mapping else "" for name in ("model-mapping", "mapping"))

@@ -228,12 +228,11 @@ def _remedies(comparison: Comparison, failed: Sequence[EquivalenceTest], refused
             begin = (
                 f"The simulation had {fitted} already. Identify once more, with the recordings behind that file added"
             )
-        steps.append(
-            f"{begin} ({identify}), then "
-            + (f"measure again with {again}." if model else "")
-            + (f"carry its values over to {foreign}." if foreign and not model else "")
-            + ("" if foreign else _test_of_the_plant(comparison, out))
-        )
+        if model:
+            then = f"measure again with {again}."
+        else:
+            then = f"carry its values over to {foreign}." if foreign else _test_of_the_plant(comparison, out)
+        steps.append(f"{begin} ({identify}), then {then}")
         if fitted:
             steps.append(
                 "If that is no too, no parameters suffice: the model lacks what the hardware does. Measure which "

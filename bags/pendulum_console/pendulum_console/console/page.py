@@ -83,7 +83,7 @@ def serve(
     def page() -> None:
         Layout(graph, jobs).build()
 
-    # A page that a busy computer keeps waiting for longer is loaded anew, and what is pressed meanwhile is lost.
+    # A page that a busy computer keeps waiting for longer is loaded again, and what is pressed meanwhile is lost.
     ui.run_with(app, dark=None, show_welcome_message=False, reconnect_timeout=_RECONNECT_TIMEOUT)
     # Quasar's request bar has no name for a screen reader, and adds nothing to the page.
     pages.config.quasar_config["loadingBar"]["skipHijack"] = True
