@@ -22,6 +22,7 @@ from pendulum_bags.arrays import Array
 from pendulum_bags.recordings.delimited import read_delimited
 from pendulum_bags.studies.real_ai_gym import CONTESTS, Trial, published_score, score_of_rows, trajectory_rows
 from pendulum_lqr.policies.bounded_files import read_bounded
+from pendulum_lqr.policies.policy import Network
 from pendulum_lqr.policies.torch_state import read_state
 from pendulum_msgs_py.errors import DataError, ParameterError
 from pendulum_msgs_py.plants.plant_parameters import PlantParameters, load_mechanism
@@ -252,20 +253,19 @@ def _network(
     try:
         with zipfile.ZipFile(io.BytesIO(read_bounded(file, str(file), _LARGEST))) as archive:
             state = read_state(archive.read("policy.pth"))
-        layers = [(state[f"{names[0]}.{i}.weight"], state[f"{names[0]}.{i}.bias"]) for i in (0, 2)]
-        last, bias = state[f"{names[1]}.weight"], state[f"{names[1]}.bias"]
+        layers = (f"{names[0]}.0", f"{names[0]}.2", names[1])
+        weights, biases = (tuple(state[f"{layer}.{part}"] for layer in layers) for part in ("weight", "bias"))
     except (KeyError, zipfile.BadZipFile) as error:
         raise DataError(f"{file} is no archive of a policy with two hidden layers ({error})") from error
+    network = Network(weights, biases, "relu", "tanh")
     mean, variance = normalisation
     where = np.array([torque, 0.0] if robot == "pendubot" else [0.0, torque])
 
     def policy(state: Array) -> Array:
         angles = (state[:2] % (2.0 * math.pi) - math.pi) / math.pi
         seen = np.concatenate([angles, np.clip(state[2:], -speed, speed) / speed])
-        out = np.clip((seen - mean) / np.sqrt(variance + 1e-8), -10.0, 10.0).astype(np.float32)
-        for weight, shift in layers:
-            out = np.maximum(weight @ out + shift, 0.0)
-        return where * float(np.tanh(last @ out + bias)[0])
+        scaled = np.clip((seen - mean) / np.sqrt(variance + 1e-8), -10.0, 10.0).astype(np.float32)
+        return where * float(network.forward(scaled)[0])
 
     return policy
 
